@@ -1,0 +1,313 @@
+"""YAML files to frozen, validated types. Imports no JAX.
+
+Every physical value of a robot is written with where it comes from::
+
+    radius_m: {value: 0.030, source: assumed, why: "not published"}
+
+so that a figure in a paper can be traced to a published, derived or assumed number.
+Field names carry their unit. Tendons, segments, servos and axial positions count from 1 in files.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+from functools import cached_property
+from pathlib import Path
+from typing import Annotated, Any, Generic, Literal, Self, TypeVar
+
+import yaml
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
+
+_CHECKOUT = Path(__file__).resolve().parent.parent
+_WHEEL = Path(__file__).resolve().parent / "_data"
+
+
+class ConfigError(ValueError):
+    """A configuration file that cannot be used; the message names field, value and limit."""
+
+
+def data_folder(kind: str) -> Path:
+    """Folder of shipped data (``"configs"``), in a checkout or inside an installed wheel."""
+    inside_wheel = _WHEEL / kind
+    return inside_wheel if inside_wheel.is_dir() else _CHECKOUT / kind
+
+
+def resolve(name_or_path: str | Path, folder: str) -> Path:
+    """Path of a shipped file by its bare name, or of a user's file by its path.
+
+    Args:
+        name_or_path: ``"muxarm"`` for the shipped file, or any path that ends in .yaml or .yml.
+        folder: Folder below ``configs`` in which bare names are looked up, such as ``"robots"``.
+
+    Raises:
+        ConfigError: No such file; the message lists the shipped names.
+    """
+    path = Path(name_or_path)
+    if path.suffix in {".yaml", ".yml"}:
+        if not path.is_file():
+            raise ConfigError(f"{path}: no such file")
+        return path
+    shipped = data_folder("configs") / folder
+    candidate = shipped / f"{name_or_path}.yaml"
+    if path.name != str(name_or_path) or not candidate.is_file():
+        names = ", ".join(sorted(p.stem for p in shipped.glob("*.yaml")))
+        raise ConfigError(
+            f"{folder}: no {str(name_or_path)!r} among the shipped files ({names}); "
+            "a file of your own is named by a path ending in .yaml"
+        )
+    return candidate
+
+
+class Strict(BaseModel):
+    """Base of every configuration type: unknown keys, NaN and later changes are refused."""
+
+    model_config = ConfigDict(
+        extra="forbid", frozen=True, allow_inf_nan=False, populate_by_name=True
+    )
+
+
+AnyStrict = TypeVar("AnyStrict", bound=Strict)
+
+
+def load_yaml(model: type[AnyStrict], path: Path) -> AnyStrict:
+    """Read one YAML file into ``model``.
+
+    Raises:
+        ConfigError: Unreadable YAML, or a field that is wrong; every wrong field is listed with
+            its path, the value found and the limit.
+    """
+    try:
+        raw = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
+        raise ConfigError(f"{path}: not readable as YAML: {error}") from error
+    if not isinstance(raw, dict):
+        raise ConfigError(f"{path}: expected a mapping at the top, found {type(raw).__name__}")
+    try:
+        return model.model_validate(raw)
+    except ValidationError as error:
+        raise ConfigError(f"{path}: {_explain(error)}") from error
+
+
+def _explain(error: ValidationError) -> str:
+    lines = []
+    for item in error.errors(include_url=False):
+        where = "".join(f"[{p + 1}]" if isinstance(p, int) else f".{p}" for p in item["loc"])
+        found = "" if item["type"] in {"missing", "value_error"} else f", found {item['input']!r}"
+        lines.append(f"{where.lstrip('.') or 'file'}: {item['msg']}{found}")
+    return "; ".join(lines)
+
+
+Value = TypeVar("Value")
+
+
+class Sourced(Strict, Generic[Value]):
+    """A value, where it comes from, and why it is what it is."""
+
+    value: Value
+    source: Literal["published", "derived", "assumed"]
+    why: Annotated[str, Field(min_length=3)]
+
+
+Positive = Annotated[float, Field(gt=0)]
+NotNegative = Annotated[float, Field(ge=0)]
+Vector3 = tuple[float, float, float]
+
+
+class FrameConfig(Strict):
+    """A rigid frame: translation, then roll-pitch-yaw as Rz(yaw) Ry(pitch) Rx(roll)."""
+
+    xyz_m: Vector3 = (0.0, 0.0, 0.0)
+    rpy_deg: Vector3 = (0.0, 0.0, 0.0)
+
+
+class SegmentConfig(Strict):
+    """One continuum segment, base to tip."""
+
+    length_m: Sourced[Annotated[float, Field(gt=0, le=10)]]
+    n_discs: Sourced[Annotated[int, Field(ge=1, le=1000)]]
+    theta_max_deg: Sourced[Annotated[float, Field(gt=0, le=360)]]
+    tendon_offset_deg: Sourced[float]
+
+
+class TendonConfig(Strict):
+    """Tendon routing; see MODEL.md section 3 for the azimuth table psi[n, i, j]."""
+
+    per_segment: Sourced[Annotated[int, Field(ge=3, le=64)]]
+    radius_m: Sourced[Positive]
+    routing: Sourced[Literal["parallel", "printed", "table"]]
+    azimuth_deg: tuple[tuple[tuple[float, ...], ...], ...] | None = Field(
+        default=None, description="psi[n][i][j], only with routing 'table'"
+    )
+
+
+class BodyConfig(Strict):
+    """The arm's outer shape and mass."""
+
+    disc_radius_m: Sourced[Positive]
+    mass_kg: Sourced[Positive]
+    driver_payload_kg: Sourced[Positive]
+
+
+class TransmissionConfig(Strict):
+    """From servo shaft to tendon."""
+
+    gear_ratio: Sourced[Positive]
+    wheel_radius_m: Sourced[Positive]
+
+
+class ServoConfig(Strict):
+    """One radial servo; there are as many as tendons in a segment."""
+
+    speed_rpm: Sourced[Positive]
+    rated_torque_nm: Sourced[Positive]
+    peak_torque_nm: Sourced[Positive]
+    stall_torque_nm: Sourced[Positive]
+
+
+class AxialConfig(Strict):
+    """The axial motor and the map c = F(a, s) of M Eq. 10."""
+
+    switch_time_s: Sourced[NotNegative]
+    map: Sourced[Literal["rule"] | tuple[tuple[int, ...], ...]] = Field(
+        description="'rule' of MODEL.md section 4, or for each axial position the tendon number "
+        "that each servo meets there"
+    )
+
+
+class ClutchConfig(Strict):
+    """Electromagnetic clutches."""
+
+    engage_time_s: Sourced[NotNegative]
+    coil_current_a: Sourced[Positive]
+    slip_m: Sourced[NotNegative] = Field(description="tendon change at each switch")
+
+
+class EncoderConfig(Strict):
+    """Winding-wheel encoders."""
+
+    bits: Sourced[Annotated[int, Field(ge=8, le=24)]]
+    inl_deg: Sourced[NotNegative]
+
+
+class RobotConfig(Strict):
+    """A time-multiplexed tendon arm as its YAML file states it."""
+
+    file_schema: Literal["muxjax/robot/1"] = Field(alias="schema")
+    name: Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]*$")]
+    base_frame: FrameConfig = FrameConfig()
+    tool_frame: FrameConfig = FrameConfig()
+    segments: Annotated[tuple[SegmentConfig, ...], Field(min_length=1, max_length=32)]
+    tendons: TendonConfig
+    body: BodyConfig
+    transmission: TransmissionConfig
+    servo: ServoConfig
+    axial: AxialConfig
+    clutch: ClutchConfig
+    encoder: EncoderConfig
+
+    @field_validator("segments")
+    @classmethod
+    def _tendons_fit(cls, segments: tuple[SegmentConfig, ...]) -> tuple[SegmentConfig, ...]:
+        for number, segment in enumerate(segments, start=1):
+            per_gap = math.radians(segment.theta_max_deg.value) / segment.n_discs.value
+            if per_gap >= math.pi:
+                raise ValueError(
+                    f"segment {number}: theta_max_deg / n_discs is {math.degrees(per_gap):g} "
+                    "degrees a disc, must be below 180"
+                )
+        return segments
+
+    @model_validator(mode="after")
+    def _routing_is_complete(self) -> Self:
+        table, kind = self.tendons.azimuth_deg, self.tendons.routing.value
+        s, j = self.n_segments, self.n_servos
+        if (table is not None) != (kind == "table"):
+            raise ValueError("tendons.azimuth_deg: given if and only if routing is 'table'")
+        if table is None:
+            return self
+        if [len(row) for row in table] != [s] * s or any(len(t) != j for r in table for t in r):
+            raise ValueError(f"tendons.azimuth_deg: must have shape {s} x {s} x {j}")
+        for i in range(s):
+            own = table[i][i]
+            for k, azimuth in enumerate(own):
+                gap = (azimuth - own[0] - 360.0 * k / j + 180.0) % 360.0 - 180.0
+                if abs(gap) > 1e-9:
+                    raise ValueError(
+                        f"tendons.azimuth_deg[{i + 1}][{i + 1}]: the tendons of a segment must be "
+                        f"evenly spaced in it; tendon {k + 1} is {gap:g} degrees off"
+                    )
+        return self
+
+    @model_validator(mode="after")
+    def _axial_map_is_onto(self) -> Self:
+        rows, j = self.axial_map, self.n_servos
+        for a, row in enumerate(rows, start=1):
+            where = f"axial.map.value[{a}]"
+            if len(row) != j:
+                raise ValueError(f"{where}: must name {j} tendons, one a servo; found {len(row)}")
+            if any(not 1 <= c <= self.n_tendons for c in row):
+                raise ValueError(f"{where}: tendons are 1 to {self.n_tendons}, found {row}")
+            if len({(c - 1) // j for c in row}) > 1 or len(set(row)) < j:
+                raise ValueError(
+                    f"{where}: all servos of one axial position must meet different tendons "
+                    f"of one segment (the layer constraint P_i), found {row}"
+                )
+        missing = set(range(1, self.n_tendons + 1)) - {c for row in rows for c in row}
+        if missing:
+            raise ValueError(f"axial.map.value: no axial position reaches tendons {missing}")
+        return self
+
+    @property
+    def n_segments(self) -> int:
+        """S."""
+        return len(self.segments)
+
+    @property
+    def n_servos(self) -> int:
+        """J: radial servos, equal to the tendons of a segment."""
+        return self.tendons.per_segment.value
+
+    @property
+    def n_tendons(self) -> int:
+        """S * J."""
+        return self.n_segments * self.n_servos
+
+    @cached_property
+    def axial_map(self) -> tuple[tuple[int, ...], ...]:
+        """Tendon number met by servo s at axial position a, [a][s], counting from 1.
+
+        The rule (MODEL.md section 4): plug = (a + S s) mod (S J), layer = plug mod S,
+        tendon of the layer = plug div S, all counting from 0.
+        """
+        if self.axial.map.value != "rule":
+            return self.axial.map.value
+        s, j = self.n_segments, self.n_servos
+        plugs = [[(a + s * servo) % (s * j) for servo in range(j)] for a in range(s * j)]
+        return tuple(tuple(j * (p % s) + p // s + 1 for p in row) for row in plugs)
+
+    @cached_property
+    def fingerprint(self) -> str:
+        """Hash over every value (not the reasons), by which programs name their robot."""
+        values = _values_only(self.model_dump(mode="json"))
+        text = json.dumps(values, sort_keys=True, separators=(",", ":"))
+        return hashlib.sha256(text.encode()).hexdigest()[:16]
+
+    # A robot is a static argument of compiled functions: comparing two 16-character strings keeps
+    # the call overhead of those functions small.
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, RobotConfig) and self.fingerprint == other.fingerprint
+
+    def __hash__(self) -> int:
+        return hash(self.fingerprint)
+
+
+def _values_only(tree: Any) -> Any:
+    if isinstance(tree, dict):
+        if tree.keys() == {"value", "source", "why"}:
+            return tree["value"]
+        return {key: _values_only(item) for key, item in tree.items()}
+    if isinstance(tree, list):
+        return [_values_only(item) for item in tree]
+    return tree

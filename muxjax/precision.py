@@ -1,0 +1,75 @@
+"""Which precision a call runs in.
+
+JAX computes in float32 unless its x64 switch is on. Kinematics and planning need float64, and a
+library must not flip a global switch. The rule here: **NumPy in, NumPy float64 out; JAX in, JAX
+out.** A call on host data (lists, NumPy arrays) runs compiled, in a local float64 context; a call
+on JAX arrays or inside a trace is an ordinary JAX function whose precision is the caller's.
+"""
+
+from __future__ import annotations
+
+import functools
+import inspect
+from collections.abc import Callable, Sequence
+from typing import Any, TypeVar
+
+import jax
+import numpy as np
+
+F = TypeVar("F", bound=Callable[..., Any])
+
+
+def host_array(name: str, value: Any, last: int | None = None) -> np.ndarray:
+    """``value`` as a float64 NumPy array, checked.
+
+    Args:
+        name: How errors call the value.
+        value: Anything array-like.
+        last: Required size of the last axis, if any.
+
+    Raises:
+        ValueError: Not numeric, wrong last axis, or an entry that is not finite.
+    """
+    try:
+        array = np.asarray(value, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"{name}: expected numbers in a regular array ({error})") from None
+    if last is not None:
+        check_last_axis(name, array.shape, last)
+    if not np.isfinite(array).all():
+        index = tuple(int(i) for i in np.argwhere(~np.isfinite(array))[0])
+        raise ValueError(f"{name}: entry {index} is {array[index]}, must be finite")
+    return array
+
+
+def check_last_axis(name: str, shape: tuple[int, ...], last: int) -> None:
+    """Raise ValueError unless ``shape`` ends in ``last``."""
+    if not shape or shape[-1] != last:
+        raise ValueError(f"{name}: last axis must have {last} entries, found shape {shape}")
+
+
+def numpy_in_numpy_out(*, static: Sequence[str] = ()) -> Callable[[F], F]:
+    """Decorate ``fn(robot, *arrays)`` so that it follows the rule at the top of this file.
+
+    Args:
+        static: Names of arguments that are not arrays and select what is compiled.
+    """
+
+    def decorate(fn: F) -> F:
+        signature = inspect.signature(fn)
+        compiled = jax.jit(fn, static_argnames=tuple(static))
+
+        @functools.wraps(fn)
+        def face(robot: Any, *args: Any, **kwargs: Any) -> Any:
+            if any(isinstance(x, jax.Array) for x in jax.tree.leaves((robot, args, kwargs))):
+                return fn(robot, *args, **kwargs)
+            bound = signature.bind(robot, *args, **kwargs)
+            for name in list(bound.arguments)[1:]:
+                if name not in static:
+                    bound.arguments[name] = host_array(name, bound.arguments[name])
+            with jax.enable_x64(True):
+                return jax.tree.map(np.asarray, compiled(*bound.args, **bound.kwargs))
+
+        return face  # type: ignore[return-value]
+
+    return decorate

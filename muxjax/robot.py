@@ -1,0 +1,132 @@
+"""The robot as a pytree: what the formulas need, in SI units."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import equinox as eqx
+import jax
+import numpy as np
+from jaxtyping import Float, Int
+
+from muxjax.config import FrameConfig, RobotConfig, load_yaml, resolve
+
+Array = jax.Array | np.ndarray
+
+
+class Robot(eqx.Module):
+    """A time-multiplexed tendon arm.
+
+    The leaves are float64 NumPy arrays, so one robot serves float32 and float64 code alike and
+    any of them can be differentiated or swept. ``config`` is static: counts, the axial map and
+    whatever only the hardware needs.
+    """
+
+    length: Float[Array, " S"]  # L_i [m]
+    theta_max: Float[Array, " S"]  # [rad]
+    tendon_radius: Float[Array, ""]  # r_a [m]
+    tendon_azimuth: Float[Array, "S S J"]  # psi[n, i, j] [rad], used for n <= i
+    body_radius: Float[Array, ""]  # outer radius of the discs [m]
+    base: Float[Array, "4 4"]  # pose of the arm's root in the world
+    tool: Float[Array, "4 4"]  # pose of the tool in the last disc's frame
+    gear_ratio: Float[Array, ""]  # servo turns a wheel turn
+    wheel_radius: Float[Array, ""]  # r_w [m]
+    servo_speed: Float[Array, ""]  # omega [rad/s] at the servo's shaft
+    switch_time: Float[Array, ""]  # t_sw [s]
+    config: RobotConfig = eqx.field(static=True)
+
+    @property
+    def n_segments(self) -> int:
+        """S."""
+        return self.config.n_segments
+
+    @property
+    def tendons_per_segment(self) -> int:
+        """J, also the number of radial servos."""
+        return self.config.n_servos
+
+    @property
+    def n_tendons(self) -> int:
+        """S * J."""
+        return self.config.n_tendons
+
+    @property
+    def n_discs(self) -> np.ndarray:
+        """xi_i, shape (S,)."""
+        return np.array([s.n_discs.value for s in self.config.segments], dtype=np.float64)
+
+    @property
+    def axial_map(self) -> Int[np.ndarray, "A J"]:
+        """F(a, s) = c of M Eq. 10, counting from 0."""
+        return np.array(self.config.axial_map) - 1
+
+    @property
+    def servo_per_metre(self) -> Float[Array, ""]:
+        """N = gear ratio / wheel radius [rad/m]: servo angle for a tendon displacement."""
+        return self.gear_ratio / self.wheel_radius
+
+    @property
+    def tendon_speed(self) -> Float[Array, ""]:
+        """Fastest tendon displacement omega / N [m/s]."""
+        return self.servo_speed / self.servo_per_metre
+
+
+def load_robot(name_or_path: str | Path) -> Robot:
+    """Read a robot: a shipped one by name (``"muxarm"``, ``"penta"``), or a YAML file by path.
+
+    Raises:
+        ConfigError: No such robot, or a file with wrong values; the message names each field's
+            path, the value found and its limit.
+    """
+    return robot_from_config(load_yaml(RobotConfig, resolve(name_or_path, "robots")))
+
+
+def robot_from_config(config: RobotConfig) -> Robot:
+    """Robot of a validated configuration."""
+    segments = config.segments
+    return Robot(
+        length=np.array([s.length_m.value for s in segments]),
+        theta_max=np.deg2rad([s.theta_max_deg.value for s in segments]),
+        tendon_radius=np.array(config.tendons.radius_m.value),
+        tendon_azimuth=_azimuth_table(config),
+        body_radius=np.array(config.body.disc_radius_m.value),
+        base=_frame(config.base_frame),
+        tool=_frame(config.tool_frame),
+        gear_ratio=np.array(config.transmission.gear_ratio.value),
+        wheel_radius=np.array(config.transmission.wheel_radius_m.value),
+        servo_speed=np.array(config.servo.speed_rpm.value * 2 * np.pi / 60),
+        switch_time=np.array(config.axial.switch_time_s.value),
+        config=config,
+    )
+
+
+def _azimuth_table(config: RobotConfig) -> Float[np.ndarray, "S S J"]:
+    """psi[n, i, j]; MODEL.md section 3.
+
+    "parallel": a tendon keeps its own azimuth, alpha_i + 2 pi j / J.
+    "printed": Eq. 6 read to the letter, alpha_n + 2 pi j / J in every segment n it crosses.
+    """
+    s, j = config.n_segments, config.n_servos
+    if config.tendons.azimuth_deg is not None:
+        return np.deg2rad(np.array(config.tendons.azimuth_deg))
+    alpha = np.deg2rad([segment.tendon_offset_deg.value for segment in config.segments])
+    within = 2 * np.pi * np.arange(j) / j
+    own = (
+        alpha[None, :, None] if config.tendons.routing.value == "parallel" else alpha[:, None, None]
+    )
+    return np.broadcast_to(own + within, (s, s, j)).copy()
+
+
+def _frame(frame: FrameConfig) -> Float[np.ndarray, "4 4"]:
+    (cr, cp, cy), (sr, sp, sy) = (
+        np.cos(np.deg2rad(frame.rpy_deg)),
+        np.sin(np.deg2rad(frame.rpy_deg)),
+    )
+    pose = np.eye(4)
+    pose[:3, :3] = [
+        [cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr],
+        [sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr],
+        [-sp, cp * sr, cp * cr],
+    ]
+    pose[:3, 3] = frame.xyz_m
+    return pose

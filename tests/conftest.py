@@ -1,0 +1,41 @@
+"""Shared fixtures. Shape annotations are checked at run time here, and only here."""
+
+from __future__ import annotations
+
+import os
+
+# Two cores are shared by the test workers; XLA's own thread pools would only fight over them.
+os.environ.setdefault("XLA_FLAGS", "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1")
+
+from jaxtyping import install_import_hook
+
+install_import_hook("muxjax", "beartype.beartype")
+
+import numpy as np
+import pytest
+
+import muxjax
+from muxjax.robot import Robot
+
+
+@pytest.fixture(scope="session", params=["muxarm", "penta"])
+def robot(request: pytest.FixtureRequest) -> Robot:
+    """Both shipped robots in turn."""
+    return muxjax.load_robot(request.param)
+
+
+@pytest.fixture(scope="session")
+def muxarm() -> Robot:
+    return muxjax.load_robot("muxarm")
+
+
+@pytest.fixture
+def rng() -> np.random.Generator:
+    return np.random.default_rng(20260418)
+
+
+def random_configurations(robot: Robot, rng: np.random.Generator, *batch: int) -> np.ndarray:
+    """Uniform over the allowed bending angles and all azimuths, shape (*batch, 2S)."""
+    theta = rng.uniform(0.0, robot.theta_max, (*batch, robot.n_segments))
+    phi = rng.uniform(0.0, 2 * np.pi, (*batch, robot.n_segments))
+    return np.stack([theta, phi], axis=-1).reshape(*batch, -1)

@@ -92,7 +92,7 @@ def segment_transform(
         [-c1 * bx, -c1 * by, 1 - c2 * u, length * c1],
         [zero, zero, zero, one],
     ]
-    return jnp.stack([jnp.stack(jnp.broadcast_arrays(*row), axis=-1) for row in rows], axis=-2)
+    return jnp.stack([jnp.stack(row, axis=-1) for row in rows], axis=-2)
 
 
 def pose_from_bending(robot: Robot, b: Float[Array, "*batch S 2"]) -> Float[Array, "*batch 4 4"]:
@@ -237,7 +237,7 @@ def _segment_twist(
     """
     bx, by = b[..., 0], b[..., 1]
     u = bx * bx + by * by
-    c1, c2, c3, c4 = (stumpff(u, k) for k in (1, 2, 3, 4))
+    c2, c3, c4 = (stumpff(u, k) for k in (2, 3, 4))
     slope = 2 * c4 - c3
     linear = [
         [c2 + slope * bx * bx, slope * bx * by],

@@ -5,11 +5,15 @@ from __future__ import annotations
 import os
 
 # Two cores are shared by the test workers; XLA's own thread pools would only fight over them.
-os.environ.setdefault("XLA_FLAGS", "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1")
+os.environ.setdefault(
+    "XLA_FLAGS", "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1"
+)
 
 from jaxtyping import install_import_hook
 
-install_import_hook("muxjax", "beartype.beartype")
+# The rooms with annotated array shapes; pydantic checks config.py itself.
+SHAPED = ["robot", "kinematics", "tendons", "ik", "planning", "scheduler", "metrics", "pipeline"]
+install_import_hook([f"muxjax.{room}" for room in SHAPED], "beartype.beartype")
 
 import numpy as np
 import pytest

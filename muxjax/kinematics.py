@@ -86,7 +86,7 @@ def segment_transform(
     u = bx * bx + by * by
     c1, c2 = stumpff(u, 1), stumpff(u, 2)
     one, zero = jnp.ones_like(u), jnp.zeros_like(u)
-    rows = [
+    rows: list[list[Array]] = [
         [1 - c2 * bx * bx, -c2 * bx * by, c1 * bx, length * c2 * bx],
         [-c2 * bx * by, 1 - c2 * by * by, c1 * by, length * c2 * by],
         [-c1 * bx, -c1 * by, 1 - c2 * u, length * c1],

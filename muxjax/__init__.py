@@ -2,16 +2,28 @@
 
 from muxjax.config import ConfigError
 from muxjax.kinematics import backbone, forward_kinematics, jacobian
+from muxjax.metrics import Metrics, evaluate
+from muxjax.planning import Plan, PlanningError, Problem, plan
 from muxjax.robot import Robot, load_robot
+from muxjax.scheduler import Instruction, Program, schedule
 from muxjax.tendons import configuration_from_tendons, tendon_displacements
 
 __all__ = [
     "ConfigError",
+    "Instruction",
+    "Metrics",
+    "Plan",
+    "PlanningError",
+    "Problem",
+    "Program",
     "Robot",
     "backbone",
     "configuration_from_tendons",
+    "evaluate",
     "forward_kinematics",
     "jacobian",
     "load_robot",
+    "plan",
+    "schedule",
     "tendon_displacements",
 ]

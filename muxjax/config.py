@@ -294,6 +294,9 @@ class RobotConfig(Strict):
         text = json.dumps(values, sort_keys=True, separators=(",", ":"))
         return hashlib.sha256(text.encode()).hexdigest()[:16]
 
+    def __repr__(self) -> str:
+        return f"RobotConfig({self.name!r}, {self.fingerprint})"
+
     # A robot is a static argument of compiled functions: comparing two 16-character strings keeps
     # the call overhead of those functions small.
     def __eq__(self, other: object) -> bool:

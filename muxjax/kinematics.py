@@ -57,13 +57,13 @@ def _stumpff_jvp(k, primals, tangents):  # type: ignore[no-untyped-def]
     return stumpff(u, k), 0.5 * (k * stumpff(u, k + 2) - stumpff(u, k + 1)) * du
 
 
-def bending_from_configuration(q: Float[Array, "*batch 2S"]) -> Float[Array, "*batch S 2"]:
+def bending_from_configuration(q: Float[Array, "*batch dof"]) -> Float[Array, "*batch S 2"]:
     """b_i = theta_i (cos phi_i, sin phi_i) of the polar q, both in rad."""
     theta, phi = q[..., 0::2], q[..., 1::2]
     return jnp.stack([theta * jnp.cos(phi), theta * jnp.sin(phi)], axis=-1)
 
 
-def configuration_from_bending(b: Float[Array, "*batch S 2"]) -> Float[Array, "*batch 2S"]:
+def configuration_from_bending(b: Float[Array, "*batch S 2"]) -> Float[Array, "*batch dof"]:
     """Polar q with theta >= 0 and phi in [0, 2 pi); phi = 0 where theta = 0.
 
     Not differentiable at theta = 0, as polar coordinates are not.
@@ -112,7 +112,7 @@ def segment_ends(robot: Robot, b: Float[Array, "*batch S 2"]) -> Float[Array, "*
 
 
 @numpy_in_numpy_out()
-def forward_kinematics(robot: Robot, q: Float[Array, "*batch 2S"]) -> Float[Array, "*batch 4 4"]:
+def forward_kinematics(robot: Robot, q: Float[Array, "*batch dof"]) -> Float[Array, "*batch 4 4"]:
     """Tool pose in the world for a configuration (M Eq. 1-2).
 
     Args:
@@ -131,8 +131,8 @@ def forward_kinematics(robot: Robot, q: Float[Array, "*batch 2S"]) -> Float[Arra
 
 @numpy_in_numpy_out(static=("n",))
 def backbone(
-    robot: Robot, q: Float[Array, "*batch 2S"], n: int
-) -> Float[Array, "*batch S*{n}+1 4 4"]:
+    robot: Robot, q: Float[Array, "*batch dof"], n: int
+) -> Float[Array, "*batch frames 4 4"]:
     """Frames along the backbone, n a segment at equal arc length, base first, tip last.
 
     The last one is the distal disc of the last segment, before the tool frame.
@@ -164,8 +164,8 @@ def backbone(
 
 @numpy_in_numpy_out(static=("frame",))
 def jacobian(
-    robot: Robot, q: Float[Array, "*batch 2S"], frame: Frame = "mixed"
-) -> Float[Array, "*batch 6 2S"]:
+    robot: Robot, q: Float[Array, "*batch dof"], frame: Frame = "mixed"
+) -> Float[Array, "*batch 6 dof"]:
     """Analytic Jacobian of the tool's motion with respect to q; linear rows, then angular.
 
     Args:
@@ -196,7 +196,7 @@ def jacobian(
 
 def bending_jacobian(
     robot: Robot, b: Float[Array, "*batch S 2"], frame: Frame = "mixed"
-) -> Float[Array, "*batch 6 2S"]:
+) -> Float[Array, "*batch 6 dof"]:
     """Analytic Jacobian with respect to the Cartesian bending; rows as in ``jacobian``.
 
     Each segment adds the twist of its distal disc, carried to the tool by the rigid remainder.
@@ -255,7 +255,7 @@ def _segment_twist(
     return stack[0] * length[..., None, None], stack[1]
 
 
-def check_configuration(robot: Robot, q: object) -> Float[np.ndarray, "*batch 2S"]:
+def check_configuration(robot: Robot, q: object) -> Float[np.ndarray, "*batch dof"]:
     """Host check of a configuration that is to be used on the robot.
 
     Returns:

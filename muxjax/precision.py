@@ -42,6 +42,14 @@ def host_array(name: str, value: Any, last: int | None = None) -> np.ndarray:
     return array
 
 
+def pad_rows(rows: np.ndarray) -> np.ndarray:
+    """Rows padded with zeros to 16, 64, 256, ... so that any batch shares a few compilations."""
+    size = 16
+    while size < len(rows):
+        size *= 4
+    return np.pad(rows, ((0, size - len(rows)), *((0, 0),) * (rows.ndim - 1)))
+
+
 def check_last_axis(name: str, shape: tuple[int, ...], last: int) -> None:
     """Raise ValueError unless ``shape`` ends in ``last``."""
     if not shape or shape[-1] != last:

@@ -7,11 +7,12 @@ from pathlib import Path
 import equinox as eqx
 import jax
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from muxjax.config import FrameConfig, RobotConfig, load_yaml, resolve
 
 Array = jax.Array | np.ndarray
+Scalar = Float[Array, ""] | float
 
 
 class Robot(eqx.Module):
@@ -60,13 +61,20 @@ class Robot(eqx.Module):
         """F(a, s) = c of M Eq. 10, counting from 0."""
         return np.array(self.config.axial_map) - 1
 
+    def reach(self, servos: tuple[int, ...]) -> Bool[np.ndarray, "A SJ"]:
+        """Tendons that servos (counting from 1) meet at each axial position."""
+        table = self.axial_map[:, [s - 1 for s in servos]]
+        met = np.zeros((len(table), self.n_tendons), dtype=bool)
+        np.put_along_axis(met, table, True, axis=1)
+        return met
+
     @property
-    def servo_per_metre(self) -> Float[Array, ""]:
+    def servo_per_metre(self) -> Scalar:
         """N = gear ratio / wheel radius [rad/m]: servo angle for a tendon displacement."""
         return self.gear_ratio / self.wheel_radius
 
     @property
-    def tendon_speed(self) -> Float[Array, ""]:
+    def tendon_speed(self) -> Scalar:
         """Fastest tendon displacement omega / N [m/s]."""
         return self.servo_speed / self.servo_per_metre
 

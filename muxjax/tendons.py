@@ -42,7 +42,7 @@ def _chord_ratio(robot: Robot, b: Float[Array, "*batch 2"], segment: int) -> Flo
 
 def displacements_from_bending(
     robot: Robot, b: Float[Array, "*batch S 2"]
-) -> Float[Array, "*batch S*J"]:
+) -> Float[Array, "*batch SJ"]:
     """Tendon displacements of the Cartesian bending (M Eq. 6)."""
     psi = jnp.asarray(robot.tendon_azimuth)
     per_segment = [
@@ -56,7 +56,7 @@ def displacements_from_bending(
 
 
 def bending_from_displacements(
-    robot: Robot, displacements: Float[Array, "*batch S*J"]
+    robot: Robot, displacements: Float[Array, "*batch SJ"]
 ) -> Float[Array, "*batch S 2"]:
     """Cartesian bending that the displacements define (M Eq. 4-5 for J = 3).
 
@@ -82,7 +82,7 @@ def bending_from_displacements(
 
 
 @numpy_in_numpy_out()
-def tendon_displacements(robot: Robot, q: Float[Array, "*batch 2S"]) -> Float[Array, "*batch S*J"]:
+def tendon_displacements(robot: Robot, q: Float[Array, "*batch dof"]) -> Float[Array, "*batch SJ"]:
     """Tendon displacements [m] of a configuration [rad] (M Eq. 6); negative = wound in.
 
     Raises:
@@ -95,8 +95,8 @@ def tendon_displacements(robot: Robot, q: Float[Array, "*batch 2S"]) -> Float[Ar
 @numpy_in_numpy_out()
 def configuration_from_tendons(
     robot: Robot,
-    l: Float[Array, "*batch S*J"],  # noqa: E741 - the papers' symbol
-) -> Float[Array, "*batch 2S"]:
+    l: Float[Array, "*batch SJ"],  # noqa: E741 - the papers' symbol
+) -> Float[Array, "*batch dof"]:
     """Configuration [rad] of tendon displacements [m] (M Eq. 4-5); theta >= 0, phi in [0, 2 pi).
 
     Exact inverse of ``tendon_displacements`` on its image. NaN for a segment whose tendons are
@@ -109,7 +109,7 @@ def configuration_from_tendons(
     return configuration_from_bending(bending_from_displacements(robot, l))
 
 
-def displacement_range(robot: Robot) -> Float[np.ndarray, "S*J 2"]:
+def displacement_range(robot: Robot) -> Float[np.ndarray, "SJ 2"]:
     """Least and greatest displacement [m] of each tendon over all allowed configurations.
 
     In each segment a tendon's change is extreme in its own bending plane, towards or away from
@@ -126,7 +126,7 @@ def displacement_range(robot: Robot) -> Float[np.ndarray, "S*J 2"]:
 
 def check_displacements(
     robot: Robot, name: str, displacements: object
-) -> Float[np.ndarray, "*batch S*J"]:
+) -> Float[np.ndarray, "*batch SJ"]:
     """Host check of tendon displacements that the robot is to hold.
 
     Returns:

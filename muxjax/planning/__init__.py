@@ -1,0 +1,68 @@
+"""Planners: which tendons move, in which order (M Eq. 7-9, 13, Algorithm 1)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+from muxjax.planning.baselines import greedy, reverse, sequential
+from muxjax.planning.beamstep import beamstep, beamstep_printed
+from muxjax.planning.exact import exact
+from muxjax.planning.lattice import Lattice
+from muxjax.planning.problem import (
+    TERMS,
+    Plan,
+    PlanningError,
+    Problem,
+    Transition,
+    check_problem,
+)
+from muxjax.robot import Robot
+
+METHODS: Mapping[str, Callable[..., Plan]] = {
+    "exact": exact,
+    "beamstep": beamstep,
+    "beamstep_printed": beamstep_printed,
+    "sequential": sequential,
+    "reverse": reverse,
+    "greedy": greedy,
+}
+
+__all__ = [
+    "METHODS",
+    "TERMS",
+    "Plan",
+    "PlanningError",
+    "Problem",
+    "Transition",
+    "plan",
+]
+
+
+def plan(robot: Robot, problem: Problem, method: str = "exact", **options: Any) -> Plan:
+    """Plan the steps from ``problem.start`` to ``problem.target``.
+
+    Args:
+        robot: The arm.
+        problem: Start, target, available servos and objective.
+        method: "exact" (certified optimum), "beamstep" (layered), "beamstep_printed" (M Algorithm
+            1 to the letter), "sequential", "reverse" or "greedy" (M Eq. 13).
+        **options: Options of the method, such as ``width`` of BeamStep.
+
+    Returns:
+        The plan; a search that found none says so in ``status`` and ``reason``.
+
+    Raises:
+        ValueError: Unknown method or option, or a problem that does not fit the robot; the
+            message names the field and the limit.
+        PlanningError: "exact" on a lattice that does not fit in its memory.
+    """
+    if method not in METHODS:
+        raise ValueError(f"method: must be one of {', '.join(METHODS)}; found {method!r}")
+    check_problem(robot, problem)
+    try:
+        return METHODS[method](Lattice(robot, problem), **options)
+    except TypeError as error:
+        if options and "unexpected keyword" in str(error):
+            raise ValueError(f"{method}: {error}") from None
+        raise

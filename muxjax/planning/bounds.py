@@ -1,0 +1,80 @@
+"""What a plan still has to cost at least: admissible heuristics and certificates."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import cached_property
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from muxjax.planning.lattice import Lattice
+from muxjax.planning.problem import TERMS
+
+Bound = Callable[[Int[np.ndarray, "N SJ"], Int[np.ndarray, " N"]], Float[np.ndarray, " N"]]
+
+
+class AdmissibleBound:
+    """Lower bound on the cost to go from states of a lattice, term by term.
+
+    - travel: the residuals, exactly, since moves never turn back;
+    - switches: stops still needed by the unfinished tendons that the present stop does not reach;
+    - time: those stops' repositioning, and the motion if every servo could always work;
+    - bending: the last step ends at the target's bending;
+    - overshoot and terms of a user: nothing.
+    """
+
+    def __init__(self, lattice: Lattice) -> None:
+        self._lattice = lattice
+        problem = lattice.problem
+        # A user's term may take the name of a shipped one; no bound is known for it.
+        self._weights = {
+            name: problem.cost_weights[name]
+            for name, term in problem.weighted_terms
+            if term is TERMS.get(name)
+        }
+
+    def __call__(
+        self, remaining: Int[np.ndarray, "N SJ"], stop: Int[np.ndarray, " N"]
+    ) -> Float[np.ndarray, " N"]:
+        """Bound at states (remaining steps, present stop or -1)."""
+        unfinished = remaining > 0
+        residual = np.abs(self._end - self._lattice.displacements(remaining)) * unfinished
+        stops = self._stops_needed(unfinished, stop)
+        by_term = {
+            "travel": residual.sum(axis=-1),
+            "switches": stops,
+            "time": stops * float(self._lattice.robot.switch_time) + self._motion_time(residual),
+            "bending": unfinished.any(axis=-1) * float(np.sum(self._end_angles**2)),
+        }
+        return sum(
+            (weight * by_term[name] for name, weight in self._weights.items() if name in by_term),
+            start=np.zeros(len(remaining)),
+        )
+
+    @cached_property
+    def _end(self) -> Float[np.ndarray, " SJ"]:
+        """Where clipped moves end: the target, up to the tolerance."""
+        return self._lattice.displacements(np.zeros_like(self._lattice.steps))
+
+    @cached_property
+    def _end_angles(self) -> Float[np.ndarray, " S"]:
+        return self._lattice.angles(self._end)
+
+    def _by_layer(self, values: np.ndarray) -> np.ndarray:
+        robot = self._lattice.robot
+        return values.reshape(-1, robot.n_segments, robot.tendons_per_segment)
+
+    def _stops_needed(
+        self, unfinished: Bool[np.ndarray, "N SJ"], stop: Int[np.ndarray, " N"]
+    ) -> Int[np.ndarray, " N"]:
+        reach = self._lattice.reach
+        here = np.where((stop >= 0)[:, None], reach[stop], False)
+        elsewhere = self._by_layer(unfinished & ~here).sum(axis=-1)
+        return np.ceil(elsewhere / reach.sum(axis=-1).max()).astype(np.int64).sum(axis=-1)
+
+    def _motion_time(self, residual: Float[np.ndarray, "N SJ"]) -> Float[np.ndarray, " N"]:
+        layers = self._by_layer(residual)
+        servos = self._lattice.reach.sum(axis=-1).max()
+        shortest = np.maximum(layers.max(axis=-1), layers.sum(axis=-1) / servos)
+        return shortest.sum(axis=-1) / float(self._lattice.robot.tendon_speed)

@@ -1,0 +1,100 @@
+"""From chosen steps to a priced Plan."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from muxjax.planning.axial import fewest_repositionings
+from muxjax.planning.bounds import AdmissibleBound
+from muxjax.planning.lattice import Lattice
+from muxjax.planning.problem import Plan
+
+
+@dataclass(frozen=True)
+class Step:
+    """One chosen action: the stop, and the tendons that move there."""
+
+    stop: int
+    moves: Bool[np.ndarray, " SJ"]
+
+
+def replay(
+    lattice: Lattice,
+    steps: list[Step],
+    *,
+    method: str,
+    lower_bound: float | None = None,
+    expansions: int = 0,
+    optimal: bool = False,
+) -> Plan:
+    """The Plan of a sequence of steps that ends at the target, with its cost.
+
+    Every planner's result is priced here, so that their costs can be compared to the last bit.
+    Axial positions are the planner's, or those with the fewest repositionings where that is
+    cheaper.
+
+    Args:
+        lattice: The problem on the robot.
+        steps: From the start to the target.
+        method: Name of the planner.
+        lower_bound: What the planner has proved; by default the admissible bound at the start.
+        expansions: States whose steps were evaluated.
+        optimal: The planner has proved that nothing is cheaper.
+    """
+    moved = np.array([s.moves for s in steps], dtype=np.int64).reshape(-1, lattice.robot.n_tendons)
+    remaining = lattice.steps - np.concatenate([0 * lattice.steps[None], np.cumsum(moved, axis=0)])
+    if remaining[-1].any():
+        raise AssertionError(f"{method}: the plan ends at remaining steps {remaining[-1]}")
+    own = lattice.axial_of(np.array([s.stop for s in steps], dtype=np.int64))
+    both = lattice.costs(remaining[:-1], moved > 0)
+    cost, axial = min(
+        ((_cost(lattice, both, axial), axial) for axial in (own, _fewest(lattice, moved > 0, own))),
+        key=lambda priced: priced[0],
+    )
+    if lower_bound is None:
+        lower_bound = float(AdmissibleBound(lattice)(*_start(lattice))[0])
+    return Plan(
+        displacements=lattice.displacements(remaining),
+        axial=axial,
+        cost=cost,
+        lower_bound=cost if optimal else min(cost, lower_bound),
+        expansions=expansions,
+        problem=lattice.problem,
+        method=method,
+        status="optimal" if optimal else "feasible",
+    )
+
+
+def _cost(lattice: Lattice, both: Float[np.ndarray, "K 2"], axial: Int[np.ndarray, " K"]) -> float:
+    """Sum over steps whose cost depends on whether the axial motor moves before them."""
+    repositions = np.diff(axial, prepend=lattice.problem.axial or 0) != 0
+    return float(np.sum(np.where(repositions, both[:, 1], both[:, 0])))
+
+
+def _fewest(
+    lattice: Lattice, moving: Bool[np.ndarray, "K SJ"], own: Int[np.ndarray, " K"]
+) -> Int[np.ndarray, " K"]:
+    problem = lattice.problem
+    return fewest_repositionings(lattice.robot, moving, problem.servos, problem.axial, own)
+
+
+def failed(lattice: Lattice, *, method: str, reason: str, expansions: int) -> Plan:
+    """The Plan that says that none was found."""
+    return Plan(
+        displacements=lattice.problem.start[None],
+        axial=np.zeros(0, dtype=np.int64),
+        cost=float("inf"),
+        lower_bound=float(AdmissibleBound(lattice)(*_start(lattice))[0]),
+        expansions=expansions,
+        problem=lattice.problem,
+        method=method,
+        status="failed",
+        reason=reason,
+    )
+
+
+def _start(lattice: Lattice) -> tuple[Int[np.ndarray, "1 SJ"], Int[np.ndarray, " 1"]]:
+    return lattice.steps[None], np.array([lattice.start_stop])

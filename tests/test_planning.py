@@ -1,0 +1,301 @@
+"""Planners against each other, against brute force and against an independent programme."""
+
+from __future__ import annotations
+
+import json
+from itertools import chain, combinations, product
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+
+import muxjax
+from muxjax.planning import METHODS, PlanningError, Problem, plan
+from muxjax.planning.axial import fewest_repositionings
+from muxjax.planning.bounds import AdmissibleBound
+from muxjax.planning.exact import _Table
+from muxjax.planning.lattice import Lattice
+from muxjax.planning.motion import leg_overshoot, leg_time, relative_excess
+from muxjax.robot import Robot
+
+GOLDEN = Path(__file__).parent / "golden"
+SERVO_SETS = [s for n in (1, 2, 3) for s in combinations((1, 2, 3), n)]
+ON_THE_LATTICE = ("beamstep", "sequential", "reverse", "greedy")
+
+
+def random_targets(robot: Robot, rng: np.random.Generator, n: int) -> np.ndarray:
+    """Displacements of the benchmark's targets: theta uniform in 0.2-1.6 rad, any azimuth."""
+    theta = rng.uniform(0.2, np.minimum(1.6, robot.theta_max), (n, robot.n_segments))
+    phi = rng.uniform(0, 2 * np.pi, theta.shape)
+    return muxjax.tendon_displacements(robot, np.stack([theta, phi], -1).reshape(n, -1))
+
+
+def check_all_methods(robot: Robot, problem: Problem) -> None:
+    """The laws that hold between the planners of one problem."""
+    plans = {method: plan(robot, problem, method) for method in METHODS}
+    for method, found in plans.items():
+        assert found.status in ("optimal", "feasible"), (method, found.reason)
+        end = found.displacements[-1]
+        assert np.max(np.abs(end - problem.target)) <= problem.tolerance
+        steps = np.diff(found.displacements, axis=0)
+        if problem.max_step is not None:
+            assert np.max(np.abs(steps)) <= problem.max_step * (1 + 1e-12)
+        reached = robot.reach(problem.servos)[found.axial - 1]
+        assert not (np.abs(steps) > 0)[~reached].any()
+        assert found.lower_bound <= found.cost
+    best = plans["exact"]
+    assert best.status == "optimal"
+    for method in METHODS:
+        assert best.cost <= plans[method].cost * (1 + 1e-12)
+        assert plans[method].lower_bound <= best.cost * (1 + 1e-12)
+    assert plans["beamstep"].cost <= min(
+        plans[m].cost for m in ("sequential", "reverse", "greedy")
+    ) * (1 + 1e-12)
+
+
+@pytest.mark.parametrize("servos", SERVO_SETS)
+@pytest.mark.parametrize("max_step", [None, 0.03])
+def test_every_method_reaches_and_exact_is_least(muxarm, rng, servos, max_step):
+    for preset, target in zip(
+        ("paper", "fastest", "no-overshoot"), random_targets(muxarm, rng, 3), strict=True
+    ):
+        check_all_methods(
+            muxarm, Problem(np.zeros(9), target, servos=servos, max_step=max_step, preset=preset)
+        )
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("servos", SERVO_SETS)
+@pytest.mark.parametrize("max_step", [None, 0.03])
+def test_every_method_on_100_targets(muxarm, rng, servos, max_step):
+    for target in random_targets(muxarm, rng, 100):
+        check_all_methods(muxarm, Problem(np.zeros(9), target, servos=servos, max_step=max_step))
+
+
+@pytest.mark.parametrize("action_set", ["subsets", "all"])
+def test_from_a_bent_start_at_a_known_axial_position(muxarm, rng, action_set):
+    start, target = random_targets(muxarm, rng, 2)
+    for axial in (1, 5, 9):
+        problem = Problem(
+            start, target, servos=(1, 3), max_step=0.05, axial=axial, action_set=action_set
+        )
+        found = plan(muxarm, problem)
+        assert np.allclose(found.displacements[-1], target, atol=problem.tolerance)
+        free = plan(muxarm, Problem(start, target, servos=(1, 3), max_step=0.05))
+        if action_set == "subsets":
+            # Knowing the position saves at most the first repositioning and never costs one.
+            assert free.cost - 0.05 - 1e-12 <= found.cost <= free.cost + 1e-12
+
+
+def test_penta_has_twenty_tendons(rng):
+    penta = muxjax.load_robot("penta")
+    target = random_targets(penta, rng, 1)[0]
+    problem = Problem(np.zeros(20), target, servos=(1, 2, 3, 4))
+    check_methods = {m: plan(penta, problem, m) for m in ON_THE_LATTICE}
+    for found in check_methods.values():
+        assert np.max(np.abs(found.displacements[-1] - target)) <= problem.tolerance
+    with pytest.raises(PlanningError, match=r"GiB.*max_step.*beamstep"):
+        plan(penta, Problem(np.zeros(20), target, servos=(1, 2, 3, 4), max_step=0.005))
+
+
+# The cost of cases/planning_full_moves.json: every stage waits t_sw, also at an unchanged position.
+def stage_time(robot, t):
+    return robot.switch_time + leg_time(robot, t.after - t.before)
+
+
+def stage_overshoot(robot, t):
+    waiting = robot.switch_time * relative_excess(robot, t.before, t.goal)
+    return waiting + leg_overshoot(robot, t.before, t.after, t.goal)
+
+
+def golden_cases():
+    cases = json.loads((GOLDEN / "planning_full_moves.json").read_text())["cases"]
+    return [pytest.param(case, id=str(i)) for i, case in enumerate(cases)]
+
+
+@pytest.mark.parametrize("case", golden_cases())
+def test_exact_reproduces_an_independent_exhaustive_programme(muxarm, case):
+    assert np.allclose(muxjax.tendon_displacements(muxarm, case["q"]), case["target"], atol=1e-14)
+    for optimum in case["optimum"]:
+        problem = Problem(
+            np.zeros(9),
+            case["target"],
+            servos=tuple(optimum["servos"]),
+            weights={"stage_time": 1.0, "stage_overshoot": float(optimum["w"])},
+            terms={"stage_time": stage_time, "stage_overshoot": stage_overshoot},
+        )
+        assert plan(muxarm, problem).cost == pytest.approx(optimum["cost"], rel=1e-12)
+
+
+def cheapest_by_enumeration(lattice: Lattice, remaining: np.ndarray, axial: int) -> float:
+    """Every order of every action at every axial position, by recursion: the simplest exact."""
+    if not remaining.any():
+        return 0.0
+    costs = []
+    for position, reach in enumerate(lattice.robot.reach(lattice.problem.servos), start=1):
+        usable = np.flatnonzero(reach & (remaining > 0))
+        subsets = chain.from_iterable(combinations(usable, n) for n in range(1, len(usable) + 1))
+        for chosen in subsets:
+            moves = np.zeros_like(remaining, dtype=bool)
+            moves[list(chosen)] = True
+            cost = lattice.costs(remaining[None], moves[None])[0, int(position != axial)]
+            costs.append(cost + cheapest_by_enumeration(lattice, remaining - moves, position))
+    return min(costs)
+
+
+@pytest.mark.parametrize("preset", ["paper", "fastest", "no-overshoot"])
+@pytest.mark.parametrize("servos", [(2,), (1, 3)])
+def test_exact_equals_enumeration(muxarm, rng, preset, servos):
+    target = random_targets(muxarm, rng, 1)[0]
+    target[[1, 3, 4, 7, 8]] = 0.0
+    start = np.where(target == 0, 0.0, 0.3 * target)
+    problem = Problem(start, target, servos=servos, preset=preset, axial=2)
+    by_hand = cheapest_by_enumeration(Lattice(muxarm, problem), Lattice(muxarm, problem).steps, 2)
+    assert plan(muxarm, problem).cost == pytest.approx(by_hand, rel=1e-12)
+
+
+@pytest.mark.parametrize("preset", ["paper", "fastest", "no-overshoot"])
+def test_bound_is_admissible_at_every_state(muxarm, rng, preset):
+    for servos in SERVO_SETS:
+        target = random_targets(muxarm, rng, 1)[0]
+        lattice = Lattice(muxarm, Problem(np.zeros(9), target, servos=servos, preset=preset))
+        table = _Table(lattice, 2**30)
+        table.fill()
+        remaining = table.remaining(np.arange(len(table.value)))
+        bound = AdmissibleBound(lattice)
+        for stop in range(len(lattice.reach)):
+            stops = np.full(len(remaining), stop)
+            assert (bound(remaining, stops) <= table.value[:, stop] + 1e-12).all()
+
+
+def test_a_wide_beam_is_exact_and_certifies_itself(muxarm, rng):
+    for target in random_targets(muxarm, rng, 3):
+        problem = Problem(np.zeros(9), target, servos=(1, 2))
+        wide = plan(muxarm, problem, "beamstep", width=10_000)
+        assert wide.status == "optimal"
+        assert wide.gap == 0.0
+        assert wide.cost == pytest.approx(plan(muxarm, problem).cost, rel=1e-12)
+
+
+def test_a_value_function_guides_but_cannot_break_the_certificate(muxarm, rng):
+    target = random_targets(muxarm, rng, 1)[0]
+    problem = Problem(np.zeros(9), target, servos=(1, 2))
+    best = plan(muxarm, problem).cost
+    perverse = plan(
+        muxarm,
+        problem,
+        "beamstep",
+        width=4,
+        value_fn=lambda state, axial: -1e3 * np.abs(state).sum(axis=1),
+    )
+    assert perverse.lower_bound <= best <= perverse.cost
+
+
+def test_axial_mapping_is_a_shortest_path(muxarm, rng):
+    for _ in range(20):
+        servos = SERVO_SETS[rng.integers(len(SERVO_SETS))]
+        reach = muxarm.reach(servos)
+        preferred = rng.integers(1, 10, size=5)
+        moving = reach[preferred - 1] & (rng.random((5, 9)) < 0.7)
+        start = [None, 4][rng.integers(2)]
+        path = fewest_repositionings(muxarm, moving, servos, start, preferred)
+        feasible = [[a for a in range(1, 10) if not (row & ~reach[a - 1]).any()] for row in moving]
+        assert all(a in options for a, options in zip(path, feasible, strict=True))
+        least = min(
+            np.count_nonzero(np.diff(choice, prepend=start or 0)) for choice in product(*feasible)
+        )
+        assert np.count_nonzero(np.diff(path, prepend=start or 0)) == least
+
+
+def test_steps_are_counted_with_a_rounding_guard(muxarm):
+    target = np.zeros(9)
+    target[0] = -0.03
+    for max_step, steps in [(0.01, 3), (0.01 - 1e-9, 3), (0.0149, 3), (0.015, 2), (0.03, 1)]:
+        problem = Problem(np.zeros(9), target, max_step=max_step)
+        assert Lattice(muxarm, problem).steps[0] == steps
+
+
+def test_a_residual_within_tolerance_is_left_alone(muxarm):
+    target = np.zeros(9)
+    target[3] = 0.9e-5
+    found = plan(muxarm, Problem(np.zeros(9), target))
+    assert found.n_steps == 0
+    assert found.cost == 0.0
+
+
+def tendon_one_is_dear(robot, t):
+    return 100.0 * abs(t.after - t.before)[..., 0] + 1e-3 * t.repositions
+
+
+def test_a_users_term_works_in_every_planner(muxarm, rng):
+    target = random_targets(muxarm, rng, 1)[0]
+    for method in METHODS:
+        found = plan(
+            muxarm,
+            Problem(
+                np.zeros(9),
+                target,
+                servos=(1,),
+                weights={"dear": 2.0},
+                terms={"dear": tendon_one_is_dear},
+            ),
+            method,
+        )
+        assert found.cost == pytest.approx(2 * (100 * abs(target[0]) + 9e-3), rel=1e-9)
+
+
+def test_plans_do_not_depend_on_the_callers_precision(muxarm, rng):
+    problem = Problem(np.zeros(9), random_targets(muxarm, rng, 1)[0], servos=(1, 2))
+    plain = plan(muxarm, problem)
+    with jax.enable_x64(True):
+        assert plan(muxarm, problem).cost == plain.cost
+
+
+@pytest.mark.parametrize(
+    ("fields", "message"),
+    [
+        ({"target": [np.nan] * 9}, r"Problem.target: entry \(0,\) is nan"),
+        ({"target": np.zeros(8)}, r"Problem.target: last axis must have 9"),
+        ({"start": np.zeros((2, 9))}, r"Problem.start: must be a vector"),
+        ({"start": "straight"}, r"Problem.start: expected numbers"),
+        ({"target": np.full(9, 0.2)}, r"Problem.target: tendon 1 is at 200 mm, its range is"),
+        ({"target": [-0.09, 0.09, 0.09, 0, 0, 0, 0, 0, 0]}, r"segment 1 is .* limit 180"),
+        ({"servos": ()}, r"Problem.servos: must be a non-empty set"),
+        ({"servos": (1, 1)}, r"Problem.servos: must be a non-empty set"),
+        ({"servos": (4,)}, r"Problem.servos: the robot has servos 1 to 3, found 4"),
+        ({"servos": (0,)}, r"Problem.servos: the robot has servos 1 to 3, found 0"),
+        ({"tolerance": 0.0}, r"Problem.tolerance: must be above 0"),
+        ({"max_step": 1e-6}, r"Problem.max_step: must be above the tolerance"),
+        ({"max_step": np.nan}, r"Problem.max_step"),
+        ({"axial": 10}, r"Problem.axial: the robot has positions 1 to 9, found 10"),
+        ({"preset": "cheapest"}, r"planners: no 'cheapest' among the shipped"),
+        ({"weights": {"travel": np.nan}}, r"Problem.weights\['travel'\]"),
+        ({"weights": {"travl": 1.0}}, r"Problem.weights: no term 'travl' among"),
+        ({"action_set": "some"}, r"Problem.action_set"),
+    ],
+)
+def test_bad_problems_are_refused_by_name(muxarm, fields, message):
+    with pytest.raises(ValueError, match=message):
+        plan(muxarm, Problem(**{"start": np.zeros(9), "target": np.full(9, -0.001), **fields}))
+
+
+def test_unknown_methods_and_options_are_refused(muxarm):
+    problem = Problem(np.zeros(9), np.zeros(9))
+    with pytest.raises(ValueError, match="method: must be one of exact"):
+        plan(muxarm, problem, "best")
+    with pytest.raises(ValueError, match=r"exact: .*width"):
+        plan(muxarm, problem, "exact", width=3)
+    for method in ("beamstep", "beamstep_printed"):
+        with pytest.raises(ValueError, match="width: must be at least 1"):
+            plan(muxarm, problem, method, width=0)
+
+
+def test_the_printed_algorithm_says_when_it_gives_up(muxarm, rng):
+    problem = Problem(np.zeros(9), random_targets(muxarm, rng, 1)[0], servos=(1,))
+    found = plan(muxarm, problem, "beamstep_printed", max_expansions=5)
+    assert found.status == "failed"
+    assert found.cost == np.inf
+    assert "5 expansions" in found.reason
+    with pytest.raises(ValueError, match="found none"):
+        muxjax.schedule(muxarm, found)

@@ -1,6 +1,7 @@
 """A JAX workbench for time-multiplexed tendon-driven arms."""
 
 from muxjax.config import ConfigError
+from muxjax.ik import IkError, IkResult, IkStatus, solve_ik
 from muxjax.kinematics import backbone, forward_kinematics, jacobian
 from muxjax.metrics import Metrics, evaluate
 from muxjax.planning import Plan, PlanningError, Problem, plan
@@ -10,6 +11,9 @@ from muxjax.tendons import configuration_from_tendons, tendon_displacements
 
 __all__ = [
     "ConfigError",
+    "IkError",
+    "IkResult",
+    "IkStatus",
     "Instruction",
     "Metrics",
     "Plan",
@@ -25,5 +29,6 @@ __all__ = [
     "load_robot",
     "plan",
     "schedule",
+    "solve_ik",
     "tendon_displacements",
 ]

@@ -122,6 +122,33 @@ class FrameConfig(Strict):
     rpy_deg: Vector3 = (0.0, 0.0, 0.0)
 
 
+class TargetConfig(Strict):
+    """A named tool pose in the world, its orientation as a quaternion or as roll-pitch-yaw."""
+
+    name: str
+    position_m: Vector3
+    quaternion_wxyz: tuple[float, float, float, float] | None = None
+    rpy_deg: Vector3 | None = None
+
+    @model_validator(mode="after")
+    def _one_orientation(self) -> Self:
+        if (self.quaternion_wxyz is None) == (self.rpy_deg is None):
+            raise ValueError(f"{self.name}: give either quaternion_wxyz or rpy_deg")
+        if self.quaternion_wxyz is not None:
+            norm = math.hypot(*self.quaternion_wxyz)
+            if abs(norm - 1) > 1e-3:
+                raise ValueError(f"{self.name}: quaternion_wxyz has norm {norm:g}, must be 1")
+        return self
+
+
+class TaskConfig(Strict):
+    """Tool poses to reach one after the other, each from the straight arm."""
+
+    file_schema: Literal["muxjax/task/1"] = Field(alias="schema")
+    name: str
+    targets: Annotated[tuple[TargetConfig, ...], Field(min_length=1)]
+
+
 class SegmentConfig(Strict):
     """One continuum segment, base to tip."""
 
@@ -256,7 +283,9 @@ class RobotConfig(Strict):
                 )
         missing = set(range(1, self.n_tendons + 1)) - {c for row in rows for c in row}
         if missing:
-            raise ValueError(f"axial.map.value: no axial position reaches tendons {missing}")
+            raise ValueError(
+                f"axial.map.value: no axial position reaches tendons {sorted(missing)}"
+            )
         return self
 
     @property

@@ -70,7 +70,8 @@ def configuration_from_bending(b: Float[Array, "*batch S 2"]) -> Float[Array, "*
     """
     theta = jnp.hypot(b[..., 0], b[..., 1])
     phi = jnp.arctan2(b[..., 1], b[..., 0]) % (2 * jnp.pi)
-    phi = jnp.where(phi < 2 * jnp.pi, phi, 0.0)  # -1e-17 % 2 pi rounds to 2 pi itself
+    # -1e-17 % 2 pi rounds to 2 pi itself, and atan2(-0, -0) is not 0.
+    phi = jnp.where((theta == 0) | (phi >= 2 * jnp.pi), 0.0, phi)
     q = jnp.stack([theta, phi], axis=-1)
     return q.reshape(*q.shape[:-2], -1)
 

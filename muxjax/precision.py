@@ -76,7 +76,8 @@ def numpy_in_numpy_out(*, static: Sequence[str] = ()) -> Callable[[F], F]:
                 if name not in static:
                     bound.arguments[name] = host_array(name, bound.arguments[name])
             with jax.enable_x64(True):
-                return jax.tree.map(np.asarray, compiled(*bound.args, **bound.kwargs))
+                # A copy, because the view of a JAX array cannot be written to.
+                return jax.tree.map(np.array, compiled(*bound.args, **bound.kwargs))
 
         return face  # type: ignore[return-value]
 

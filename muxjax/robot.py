@@ -8,6 +8,7 @@ import equinox as eqx
 import jax
 import numpy as np
 from jaxtyping import Bool, Float, Int
+from scipy.spatial.transform import RigidTransform, Rotation
 
 from muxjax.config import FrameConfig, RobotConfig, load_yaml, resolve
 
@@ -126,15 +127,5 @@ def _azimuth_table(config: RobotConfig) -> Float[np.ndarray, "S S J"]:
 
 
 def _frame(frame: FrameConfig) -> Float[np.ndarray, "4 4"]:
-    (cr, cp, cy), (sr, sp, sy) = (
-        np.cos(np.deg2rad(frame.rpy_deg)),
-        np.sin(np.deg2rad(frame.rpy_deg)),
-    )
-    pose = np.eye(4)
-    pose[:3, :3] = [
-        [cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr],
-        [sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr],
-        [-sp, cp * sr, cp * cr],
-    ]
-    pose[:3, 3] = frame.xyz_m
-    return pose
+    turn = Rotation.from_euler("xyz", frame.rpy_deg, degrees=True)
+    return RigidTransform.from_components(frame.xyz_m, turn).as_matrix()

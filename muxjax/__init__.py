@@ -1,6 +1,7 @@
 """A JAX workbench for time-multiplexed tendon-driven arms."""
 
 from muxjax.config import ConfigError
+from muxjax.hardware import LockstepLink, Run, execute
 from muxjax.ik import IkError, IkResult, IkStatus, solve_ik
 from muxjax.kinematics import backbone, forward_kinematics, jacobian
 from muxjax.metrics import Metrics, evaluate
@@ -15,15 +16,18 @@ __all__ = [
     "IkResult",
     "IkStatus",
     "Instruction",
+    "LockstepLink",
     "Metrics",
     "Plan",
     "PlanningError",
     "Problem",
     "Program",
     "Robot",
+    "Run",
     "backbone",
     "configuration_from_tendons",
     "evaluate",
+    "execute",
     "forward_kinematics",
     "jacobian",
     "load_robot",

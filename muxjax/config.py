@@ -87,10 +87,11 @@ def load_yaml(model: type[AnyStrict], path: Path) -> AnyStrict:
     try:
         return model.model_validate(raw)
     except ValidationError as error:
-        raise ConfigError(f"{path}: {_explain(error)}") from error
+        raise ConfigError(f"{path}: {explain(error)}") from error
 
 
-def _explain(error: ValidationError) -> str:
+def explain(error: ValidationError) -> str:
+    """Every wrong field of a file with its path, the value found and the limit."""
     lines = []
     for item in error.errors(include_url=False):
         where = "".join(f"[{p + 1}]" if isinstance(p, int) else f".{p}" for p in item["loc"])

@@ -1,0 +1,51 @@
+"""What commands print: tables for a person, JSON for a machine."""
+
+from __future__ import annotations
+
+import json
+import math
+from typing import Any
+
+import numpy as np
+from rich.console import Console
+from scipy.spatial.transform import Rotation
+
+# Units stand in square brackets, which would otherwise be taken for markup.
+console = Console(markup=False, highlight=False)
+if not console.is_terminal:
+    console.width = 110  # a file or a pipe has no width; the default of 80 would break the tables
+
+
+def print_json(document: Any) -> None:
+    """Print a document of numbers, arrays and text; JSON has no NaN, it becomes null."""
+    print(json.dumps(_plain(document), indent=2))
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {str(key): _plain(item) for key, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_plain(item) for item in value]
+    if isinstance(value, np.ndarray):
+        return _plain(value.tolist())
+    if isinstance(value, (bool, np.bool_)):
+        return bool(value)
+    if isinstance(value, (float, np.floating)):
+        return float(value) if math.isfinite(value) else None
+    return value
+
+
+def row_of(values: Any, scale: float = 1.0, digits: int = 2) -> str:
+    """Scaled numbers side by side, without a minus before zero."""
+    return "  ".join(f"{round(scale * v, digits) + 0.0:.{digits}f}" for v in values)
+
+
+def pose_document(pose: Any) -> dict[str, Any]:
+    """A pose in every common notation."""
+    turn = Rotation.from_matrix(pose[:3, :3])
+    return {
+        "position_m": pose[:3, 3],
+        "quaternion_wxyz": turn.as_quat(scalar_first=True, canonical=True),
+        "rpy_deg": turn.as_euler("xyz", degrees=True),
+        "matrix": pose,
+    }

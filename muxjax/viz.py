@@ -23,6 +23,7 @@ from muxjax.tendons import configuration_from_tendons
 SEGMENT_COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
 TENDON_STYLES = ("-", "--", ":", "-.")
 _POINTS_A_SEGMENT = 24
+_PANELS_A_ROW = 4
 _FRAMES_A_SECOND = 10
 
 
@@ -39,47 +40,51 @@ def style(tendon: int) -> str:
 def compare_programs(
     robot: Robot, programs: Mapping[str, Program], title: str, path: str | Path
 ) -> Path:
-    """Tendon displacements and bending angles over time, a column a program (after M Fig. 6).
+    """Tendon displacements and bending angles over time, a panel a program (after M Fig. 6).
 
     Shaded stretches are motion, blank ones repositioning; dotted lines are the final angles.
 
     Args:
         robot: The arm.
-        programs: By the name that heads their column.
+        programs: By the name that heads their panel.
         title: Above the figure.
         path: Image to write; the ending chooses the format.
     """
-    figure = Figure(figsize=(2.6 * len(programs) + 5.2, 5.6), layout="constrained")
+    columns = min(len(programs), _PANELS_A_ROW)
+    bands = -(-len(programs) // columns)
+    figure = Figure(figsize=(2.8 * columns + 5.4, 4.9 * bands + 0.7), layout="constrained")
     figure.suptitle(title)
     # The second column is left empty: the arm's axis labels reach into it.
-    grid = figure.add_gridspec(2, len(programs) + 2, width_ratios=[1.7, 0.3, *[1] * len(programs)])
+    grid = figure.add_gridspec(2 * bands, columns + 2, width_ratios=[1.8, 0.3, *[1] * columns])
     arm = figure.add_subplot(grid[:, 0], projection="3d")
     first = next(iter(programs.values()))
     draw_arm(arm, robot, np.array(first.start), alpha=0.35)
     draw_arm(arm, robot, np.array(first.target))
     _frame_arm(arm, robot)
     arm.set_title("start (pale) and target", fontsize=9)
-    rows: list[list[Any]] = [[], []]
-    for column, (name, program) in enumerate(programs.items(), start=2):
-        line = timeline(robot, program)
-        lengths = figure.add_subplot(grid[0, column], sharey=rows[0][0] if rows[0] else None)
+    top: list[Any] = []
+    for number, (name, program) in enumerate(programs.items()):
+        band, column = divmod(number, columns)
+        lengths = figure.add_subplot(grid[2 * band, column + 2], sharey=top[0] if top else None)
         angles = figure.add_subplot(
-            grid[1, column], sharex=lengths, sharey=rows[1][0] if rows[1] else None
+            grid[2 * band + 1, column + 2], sharex=lengths, sharey=top[1] if top else None
         )
+        top = top or [lengths, angles]
+        line = timeline(robot, program)
         _draw_lengths(lengths, robot, line)
         _draw_angles(angles, robot, line)
         lengths.set_title(
             f"{name}\n{line.times[-1]:.1f} s, {len(program.instructions)} stages", fontsize=9
         )
-        for axes, row in zip((lengths, angles), rows, strict=True):
+        for axes in (lengths, angles):
             _shade_motion(axes, line)
             axes.grid(alpha=0.3)
-            axes.tick_params(labelsize=8, labelleft=not row)
-            row.append(axes)
+            axes.tick_params(labelsize=8, labelleft=column == 0)
         lengths.tick_params(labelbottom=False)
         angles.set_xlabel("time [s]", fontsize=9)
-    rows[0][0].set_ylabel("tendon displacement [mm]", fontsize=9)
-    rows[1][0].set_ylabel("bending angle [deg]", fontsize=9)
+        if column == 0:
+            lengths.set_ylabel("tendon displacement [mm]", fontsize=9)
+            angles.set_ylabel("bending angle [deg]", fontsize=9)
     figure.legend(*_legend(robot), loc="outside lower center", ncols=8, fontsize=8)
     return _save(figure, path)
 

@@ -65,7 +65,8 @@ def demo(
         print_json([_outcome_document(o) for o in outcomes])
     else:
         console.print(
-            "* certified optimum; overshoot (time above the final angle, peak) by segment; tool after execution"
+            "* certified optimum. By segment: share of T above the final angle, peak above it. "
+            "Tool: error after execution."
         )
         console.print(f"pictures in {out}: {', '.join(p.name for p in pictures)}")
         console.print(f"done in {time.perf_counter() - began:.0f} s")

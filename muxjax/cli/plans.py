@@ -21,7 +21,7 @@ from muxjax.planning import Problem
 from muxjax.planning import plan as plan_steps
 from muxjax.program_file import load_program, save_program
 from muxjax.robot import Robot, load_robot
-from muxjax.scheduler import Program, schedule
+from muxjax.scheduler import Program, check_same_robot, schedule
 from muxjax.tendons import tendon_displacements
 
 Method = Literal["exact", "beamstep", "beamstep_printed", "sequential", "reverse", "greedy"]
@@ -135,6 +135,7 @@ def run(
     """
     arm = load_robot(robot)
     loaded = load_program(program)
+    check_same_robot(arm, loaded)
     link = LockstepLink(arm, displacements=loaded.start, axial=loaded.axial)
     done = execute(loaded, link)
     error = np.abs(done.measured - np.array(loaded.target))

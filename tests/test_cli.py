@@ -1,0 +1,129 @@
+"""The command line as a user meets it, in its own process once and in this one otherwise."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from muxjax.cli import main
+
+
+@pytest.fixture
+def muxjax(capsys, monkeypatch, tmp_path):
+    """Run a command; returns exit code, standard output and standard error."""
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+
+    def call(*arguments: str) -> tuple[int, str, str]:
+        with pytest.raises(SystemExit) as stop:
+            main(arguments)
+        captured = capsys.readouterr()
+        return int(stop.value.code or 0), captured.out, captured.err
+
+    return call
+
+
+def test_fk_prints_millimetres_and_json_metres(muxjax):
+    code, out, _ = muxjax("fk", "60", "0", "75", "180", "40", "0")
+    assert code == 0
+    assert "152.25  0.00  413.78" in out
+    assert "[mm]" in out
+    code, out, _ = muxjax("fk", "60", "0", "75", "180", "40", "0", "--json")
+    document = json.loads(out)
+    assert document["position_m"] == pytest.approx([0.15225047, 0, 0.41377691], abs=1e-8)
+    assert np.linalg.norm(document["quaternion_wxyz"]) == pytest.approx(1)
+
+
+def test_ik_answers_with_its_exit_code(muxjax):
+    pose = ("ik", "--xyz-mm", "152.25", "0", "413.777", "--rpy-deg", "0", "25", "0")
+    code, out, _ = muxjax(*pose, "--json")
+    assert code == 0
+    assert json.loads(out)["converged"] is True
+    code, out, _ = muxjax("ik", "--xyz-mm", "0", "100", "550")
+    assert code == 1
+    assert "NOT REACHED" in out
+    code, out, _ = muxjax("ik", "--xyz-mm", "0", "100", "550", "--json")
+    assert code == 1
+    assert json.loads(out)["status"] == "out_of_reach"
+
+
+def test_plan_then_run(muxjax, tmp_path):
+    path = str(tmp_path / "program.json")
+    code, out, _ = muxjax(
+        "plan", "--q-deg", "30", "0", "20", "90", "10", "180", "--servos", "1", "3", "--out", path
+    )
+    assert code == 0
+    assert "optimal" in out
+    code, out, _ = muxjax("run", path, "--json")
+    document = json.loads(out)
+    assert code == 0
+    assert document["completed"] is True
+    assert document["largest_error_m"] < 2e-5
+    code, out, _ = muxjax("run", path)
+    assert code == 0
+    assert "completed" in out
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["fk", "60", "0"], "q: last axis must have 6"),
+        (["fk", "nan", "0", "0", "0", "0", "0"], "is nan, must be finite"),
+        (["fk", "200", "0", "0", "0", "0", "0"], "bending of segment 1 is 200 degrees, limit 180"),
+        (["fk", "1", "2", "--robot", "nobody"], "no 'nobody' among the shipped files"),
+        (["ik", "--xyz-mm", "0", "0", "5000000"], "millimetres?"),
+        (["plan"], "give either --xyz-mm"),
+        (["plan", "--q-deg", "1", "1", "1", "1", "1", "1", "--servos", "7"], "servos 1 to 3"),
+        (["plan", "--xyz-mm", "0", "100", "550"], "not reached"),
+        (["run", "nothing.json"], "nothing.json: cannot be read"),
+        (["demo", "--task", "nothing"], "no 'nothing' among the shipped files"),
+    ],
+)
+def test_bad_input_is_an_error_of_one_line(muxjax, arguments, message):
+    code, out, err = muxjax(*arguments)
+    assert code == 2
+    assert out == ""
+    assert message in err
+    assert len(err.strip().splitlines()) == 1
+
+
+def test_a_program_of_another_robot_does_not_run(muxjax, tmp_path):
+    path = str(tmp_path / "program.json")
+    muxjax("plan", "--q-deg", "30", "0", "20", "90", "10", "180", "--out", path)
+    code, _, err = muxjax("run", path, "--robot", "penta")
+    assert code == 2
+    assert "muxarm" in err
+
+
+def test_demo_draws_what_it_did(muxjax, tmp_path):
+    task = tmp_path / "task.yaml"
+    task.write_text(
+        "schema: muxjax/task/1\nname: two\ntargets:\n"
+        "  - {name: bent, position_m: [0.02901, 0.157179, 0.404852],"
+        " quaternion_wxyz: [0.97691724, 0.03292573, -0.07370458, 0.19777825]}\n"
+        "  - {name: too far, position_m: [0, 0, 0.6], rpy_deg: [0, 0, 0]}\n"
+    )
+    out = tmp_path / "pictures"
+    command = ("demo", "--task", str(task), "--out", str(out), "--methods", "exact", "greedy")
+    code, text, _ = muxjax(*command)
+    assert code == 0
+    assert "too far: not reached" in text
+    assert text.count("greedy") == 3
+    for name in ("bent.png", "arm.gif"):
+        with Image.open(out / name) as picture:
+            assert len(picture.convert("RGB").getcolors(1 << 24)) > 50, f"{name} is blank"
+
+
+def test_the_installed_command_starts():
+    done = subprocess.run(
+        [sys.executable, "-c", "from muxjax.cli import main; main()", "--help"],
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    for command in ("demo", "fk", "ik", "plan", "run"):
+        assert command in done.stdout

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 # Units stand in square brackets, which would otherwise be taken for markup.
 console = Console(markup=False, highlight=False)
 if not console.is_terminal:
-    console.width = 110  # a file or a pipe has no width; the default of 80 would break the tables
+    console.width = 120  # a file or a pipe has no width; the default of 80 would break the tables
 
 
 def print_json(document: Any) -> None:

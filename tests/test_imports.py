@@ -25,7 +25,7 @@ ORDER = [
     {"batched"},
     {"statics", "collision", "workspace", "planning"},
     {"ik", "scheduler"},
-    {"metrics", "hardware"},
+    {"metrics", "hardware", "program_file"},
     {"pipeline", "viz"},
     {"cli"},
     {"__init__", "__main__"},

@@ -130,6 +130,9 @@ class TargetConfig(Strict):
     position_m: Vector3
     quaternion_wxyz: tuple[float, float, float, float] | None = None
     rpy_deg: Vector3 | None = None
+    near_q_deg: tuple[float, ...] | None = Field(
+        default=None, description="of several configurations that reach the pose, one near this"
+    )
 
     @model_validator(mode="after")
     def _one_orientation(self) -> Self:

@@ -157,7 +157,8 @@ def run_task(
     """
     for target in task.targets:
         pose = target_pose(target)
-        found = solve_ik(robot, pose)
+        near = None if target.near_q_deg is None else np.radians(target.near_q_deg)
+        found = solve_ik(robot, pose, q0=near)
         for servos in servo_sets:
             moves: dict[str, Move] = {}
             if bool(found.converged):

@@ -216,7 +216,7 @@ def animate(
 
     def show(k: int) -> list[Any]:
         axes.clear()
-        moving = _moving_at(line, times[k])
+        moving = [] if k == len(times) - 1 else _moving_at(line, times[k])
         draw_arm(axes, robot, states[k], moving=moving)
         _frame_arm(axes, robot)
         what = (

@@ -1,16 +1,29 @@
 """A JAX workbench for time-multiplexed tendon-driven arms."""
 
+from muxjax.collision import World, clearance, load_world
 from muxjax.config import ConfigError
 from muxjax.hardware import LockstepLink, Run, execute
-from muxjax.ik import IkError, IkResult, IkStatus, solve_ik
+from muxjax.ik import (
+    AllIkResult,
+    IkError,
+    IkResult,
+    IkStatus,
+    PathResult,
+    all_ik,
+    attach_derivatives,
+    solve_ik,
+    solve_path,
+)
 from muxjax.kinematics import backbone, forward_kinematics, jacobian
 from muxjax.metrics import Metrics, evaluate
 from muxjax.planning import Plan, PlanningError, Problem, plan
 from muxjax.robot import Robot, load_robot
 from muxjax.scheduler import Instruction, Program, schedule
 from muxjax.tendons import configuration_from_tendons, tendon_displacements
+from muxjax.workspace import load_sweep, sweep
 
 __all__ = [
+    "AllIkResult",
     "ConfigError",
     "IkError",
     "IkResult",
@@ -18,21 +31,30 @@ __all__ = [
     "Instruction",
     "LockstepLink",
     "Metrics",
+    "PathResult",
     "Plan",
     "PlanningError",
     "Problem",
     "Program",
     "Robot",
     "Run",
+    "World",
+    "all_ik",
+    "attach_derivatives",
     "backbone",
+    "clearance",
     "configuration_from_tendons",
     "evaluate",
     "execute",
     "forward_kinematics",
     "jacobian",
     "load_robot",
+    "load_sweep",
+    "load_world",
     "plan",
     "schedule",
     "solve_ik",
+    "solve_path",
+    "sweep",
     "tendon_displacements",
 ]

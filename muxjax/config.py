@@ -95,9 +95,19 @@ def explain(error: ValidationError) -> str:
     lines = []
     for item in error.errors(include_url=False):
         where = "".join(f"[{p + 1}]" if isinstance(p, int) else f".{p}" for p in item["loc"])
-        found = "" if item["type"] in {"missing", "value_error"} else f", found {item['input']!r}"
-        lines.append(f"{where.lstrip('.') or 'file'}: {item['msg']}{found}")
+        silent = item["type"] in {"missing", "value_error", "json_invalid"}
+        found = "" if silent else f", found {_clipped(item['input'])}"
+        message = item["msg"].removeprefix("Value error, ")
+        place = where.lstrip(".")
+        if not place and item["type"] != "value_error":  # a check across fields names them itself
+            place = "file"
+        lines.append(f"{place}: {message}{found}" if place else message)
     return "; ".join(lines)
+
+
+def _clipped(value: object, length: int = 80) -> str:
+    text = repr(value)
+    return text if len(text) <= length else text[: length - 3] + "..."
 
 
 Value = TypeVar("Value")
@@ -126,7 +136,7 @@ class FrameConfig(Strict):
 class TargetConfig(Strict):
     """A named tool pose in the world, its orientation as a quaternion or as roll-pitch-yaw."""
 
-    name: str
+    name: Annotated[str, Field(pattern=r"^\w[\w .-]*$", description="also names its picture")]
     position_m: Vector3
     quaternion_wxyz: tuple[float, float, float, float] | None = None
     rpy_deg: Vector3 | None = None
@@ -151,6 +161,15 @@ class TaskConfig(Strict):
     file_schema: Literal["muxjax/task/1"] = Field(alias="schema")
     name: str
     targets: Annotated[tuple[TargetConfig, ...], Field(min_length=1)]
+
+    @field_validator("targets")
+    @classmethod
+    def _names_differ(cls, targets: tuple[TargetConfig, ...]) -> tuple[TargetConfig, ...]:
+        names = [target.name.replace(" ", "_") for target in targets]
+        for name in names:
+            if names.count(name) > 1:
+                raise ValueError(f"two targets are named {name!r}")
+        return targets
 
 
 class SegmentConfig(Strict):
@@ -200,7 +219,10 @@ class ServoConfig(Strict):
 class AxialConfig(Strict):
     """The axial motor and the map c = F(a, s) of M Eq. 10."""
 
-    switch_time_s: Sourced[NotNegative]
+    switch_time_s: Sourced[Positive] = Field(description="t_sw: repositioning and engagement")
+    engage_time_s: Sourced[NotNegative] = Field(
+        description="share of t_sw that remains where the drum need not turn"
+    )
     map: Sourced[Literal["rule"] | tuple[tuple[int, ...], ...]] = Field(
         description="'rule' of MODEL.md section 4, or for each axial position the tendon number "
         "that each servo meets there"
@@ -249,6 +271,15 @@ class RobotConfig(Strict):
                     "degrees a disc, must be below 180"
                 )
         return segments
+
+    @model_validator(mode="after")
+    def _engaging_is_part_of_switching(self) -> Self:
+        engage, switch = self.axial.engage_time_s.value, self.axial.switch_time_s.value
+        if engage >= switch:
+            raise ValueError(
+                f"axial.engage_time_s: must be below switch_time_s ({switch:g}), found {engage:g}"
+            )
+        return self
 
     @model_validator(mode="after")
     def _routing_is_complete(self) -> Self:

@@ -147,8 +147,8 @@ def backbone(
         ValueError: n below 1, last axis not 2S, or (on host data) an entry that is not finite.
     """
     check_last_axis("q", q.shape, 2 * robot.n_segments)
-    if n < 1:
-        raise ValueError(f"n: must be at least 1 interval a segment, found {n}")
+    if not isinstance(n, int) or n < 1:
+        raise ValueError(f"n: must be a whole number of intervals, at least 1, found {n!r}")
     b = bending_from_configuration(q)
     fraction = jnp.arange(1, n + 1, dtype=b.dtype) / n
     # A part of a constant-curvature arc is one too: bending and length shrink together.

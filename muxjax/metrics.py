@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float
 
-from muxjax.planning.motion import STRAIGHT, bending_angles, overshoot_profile
+from muxjax.planning.motion import STRAIGHT, angles_at, bending_angles, overshoot_profile
 from muxjax.planning.problem import Problem, Term, Transition, step
 from muxjax.precision import pad_rows
 from muxjax.robot import Robot
@@ -27,14 +27,16 @@ class Metrics:
     """Execution figures of a program.
 
     Attributes:
-        time_s: T of M Eq. 14 [s]; an instruction at the axial position where the drum already
-            stands needs no t_sw.
+        time_s: T of M Eq. 14 [s]; at the axial position where the drum already stands, t_sw is
+            the time of engagement alone.
         stages: Instructions. The paper's Table II counts one more (MODEL.md section 7).
         overshoot_duration: Share of T that each segment spends above its final bending
             (M Eq. 15a), with a margin of 1e-6 rad.
         overshoot_peak: Greatest excess over the final bending, relative to it (M Eq. 15b); NaN
             for a segment that ends straight (below 0.02 rad).
         overshoot_peak_rad: Greatest excess [rad].
+        bending_peak_rad: Greatest bending on the way [rad]; nothing else keeps a plan's
+            intermediate shapes within the limits of its segments.
         travel_m: Sum of |dl| [m].
     """
 
@@ -43,6 +45,7 @@ class Metrics:
     overshoot_duration: tuple[float, ...]
     overshoot_peak: tuple[float, ...]
     overshoot_peak_rad: tuple[float, ...]
+    bending_peak_rad: tuple[float, ...]
     travel_m: float
 
 
@@ -73,7 +76,7 @@ def timeline(robot: Robot, program: Program) -> Timeline:
     points, waits = [np.array(program.start)[None]], [np.zeros(1)]
     for visit, repositions in zip(waypoints(robot, program), _repositions(program), strict=True):
         points.append(visit)
-        wait = float(robot.switch_time) if repositions else 0.0
+        wait = float(robot.switch_time if repositions else robot.engage_time)
         waits.append(np.concatenate([[wait], np.zeros(len(visit) - 1)]))
     displacements = np.concatenate(points)
     moving = np.max(np.abs(np.diff(displacements, axis=0)), axis=-1) / float(robot.tendon_speed)
@@ -107,15 +110,9 @@ def evaluate(robot: Robot, program: Program) -> Metrics:
         overshoot_duration=tuple((seconds / duration if duration else seconds).tolist()),
         overshoot_peak=tuple(relative.tolist()),
         overshoot_peak_rad=tuple(np.maximum(peak, 0.0).tolist()),
+        bending_peak_rad=tuple((goal + peak).tolist()),
         travel_m=float(np.abs(after - before).sum()),
     )
-
-
-def angles_at(robot: Robot, displacements: Float[np.ndarray, "P SJ"]) -> Float[np.ndarray, "P S"]:
-    """Bending angles [rad] of displacements [m], off the image of M Eq. 6 too."""
-    with jax.enable_x64(True):
-        padded = pad_rows(displacements)
-        return np.asarray(_angles(robot, padded))[: len(displacements)]
 
 
 def program_cost(robot: Robot, problem: Problem, program: Program) -> float:
@@ -137,6 +134,7 @@ def program_cost(robot: Robot, problem: Problem, program: Program) -> float:
             pad_rows(before),
             pad_rows(after - before),
             pad_rows((first_leg & switched).astype(float)),
+            pad_rows((first_leg & ~switched).astype(float)),
             problem.target,
         )
         return float(problem.weight_vector @ np.asarray(terms)[:, : len(before)].sum(axis=1))
@@ -173,11 +171,6 @@ def _profile(
     return overshoot_profile(robot, before, after, duration, bending_angles(robot, end))
 
 
-@jax.jit
-def _angles(robot: Robot, displacements: Float[Array, "P SJ"]) -> Float[Array, "P S"]:
-    return bending_angles(robot, displacements)
-
-
 @partial(jax.jit, static_argnums=1)
 def _leg_terms(
     robot: Robot,
@@ -185,8 +178,9 @@ def _leg_terms(
     before: Float[Array, "P SJ"],
     move: Float[Array, "P SJ"],
     repositions: Float[Array, " P"],
+    engages: Float[Array, " P"],
     target: Float[Array, " SJ"],
 ) -> Float[Array, "T P"]:
     goal = bending_angles(robot, target)
-    transition: Transition = step(robot, before, move, repositions, goal)
+    transition: Transition = step(robot, before, move, repositions, engages, goal)
     return jnp.stack([term(robot, transition) for _, term in terms])

@@ -19,7 +19,7 @@ from muxjax.hardware import LockstepLink, Run, execute
 from muxjax.ik import IkResult, rotation_error, solve_ik
 from muxjax.kinematics import forward_kinematics
 from muxjax.metrics import Metrics, evaluate
-from muxjax.planning import Plan, Problem, plan
+from muxjax.planning import Plan, PlanningError, Problem, plan
 from muxjax.robot import Robot
 from muxjax.scheduler import Program, schedule
 from muxjax.tendons import configuration_from_tendons, tendon_displacements
@@ -58,12 +58,14 @@ class Outcome:
         servos: Available servos, from 1.
         ik: The configuration found; nothing was planned unless it ``converged``.
         moves: By method name.
+        refusals: Why a method has no move, by method name.
     """
 
     target: TargetConfig
     servos: tuple[int, ...]
     ik: IkResult
     moves: dict[str, Move]
+    refusals: dict[str, str]
 
 
 def target_pose(target: TargetConfig) -> Float[np.ndarray, "4 4"]:
@@ -105,10 +107,12 @@ def carry_out(
     """Plan, schedule and execute on a virtual board, then look where the tool is.
 
     Raises:
-        ValueError: The problem does not fit the robot, or the planner found no plan.
-        PlanningError: The lattice is too large for the exact planner.
+        ValueError: The problem does not fit the robot.
+        PlanningError: The planner found no plan, or the lattice is too large for the exact one.
     """
     found = plan(robot, problem, method)
+    if found.status == "failed":
+        raise PlanningError(f"{method}: {found.reason}")
     program = schedule(robot, found)
     link = LockstepLink(
         robot, displacements=problem.start, axial=problem.axial, stream_divider=_STREAM_DIVIDER
@@ -146,7 +150,8 @@ def run_task(
 ) -> Iterator[Outcome]:
     """Every target of a task from the straight arm, for each servo set and method in turn.
 
-    A pose that cannot be reached yields an outcome without moves, and the rest goes on.
+    A pose that cannot be reached yields an outcome without moves, a planner that refuses is named
+    in ``refusals``, and the rest goes on.
 
     Args:
         robot: The arm.
@@ -160,9 +165,13 @@ def run_task(
         near = None if target.near_q_deg is None else np.radians(target.near_q_deg)
         found = solve_ik(robot, pose, q0=near)
         for servos in servo_sets:
-            moves: dict[str, Move] = {}
+            outcome = Outcome(target, servos, found, {}, {})
             if bool(found.converged):
-                displacements = tendon_displacements(robot, found.q)
-                problem = Problem(np.zeros(robot.n_tendons), displacements, servos=servos, **fields)
-                moves = {method: carry_out(robot, problem, pose, method) for method in methods}
-            yield Outcome(target, servos, found, moves)
+                goal = tendon_displacements(robot, found.q)
+                problem = Problem(np.zeros(robot.n_tendons), goal, servos=servos, **fields)
+                for method in methods:
+                    try:
+                        outcome.moves[method] = carry_out(robot, problem, pose, method)
+                    except PlanningError as refusal:
+                        outcome.refusals[method] = str(refusal)
+            yield outcome

@@ -13,14 +13,16 @@ import inspect
 from collections.abc import Callable, Sequence
 from typing import Any, TypeVar
 
+import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 F = TypeVar("F", bound=Callable[..., Any])
 
 
 def host_array(name: str, value: Any, last: int | None = None) -> np.ndarray:
-    """``value`` as a float64 NumPy array, checked.
+    """A float64 NumPy copy of ``value``, checked.
 
     Args:
         name: How errors call the value.
@@ -31,7 +33,10 @@ def host_array(name: str, value: Any, last: int | None = None) -> np.ndarray:
         ValueError: Not numeric, wrong last axis, or an entry that is not finite.
     """
     try:
-        array = np.asarray(value, dtype=np.float64)
+        given = np.asarray(value)
+        if given.dtype.kind not in "biuf":
+            raise TypeError(f"found {given.dtype}")
+        array = np.array(given, dtype=np.float64)
     except (TypeError, ValueError) as error:
         raise ValueError(f"{name}: expected numbers in a regular array ({error})") from None
     if last is not None:
@@ -69,12 +74,15 @@ def numpy_in_numpy_out(*, static: Sequence[str] = ()) -> Callable[[F], F]:
 
         @functools.wraps(fn)
         def face(robot: Any, *args: Any, **kwargs: Any) -> Any:
-            if any(isinstance(x, jax.Array) for x in jax.tree.leaves((robot, args, kwargs))):
-                return fn(robot, *args, **kwargs)
+            if not isinstance(robot, eqx.Module):
+                raise ValueError(f"robot: expected a Robot, found {type(robot).__name__}")
             bound = signature.bind(robot, *args, **kwargs)
-            for name in list(bound.arguments)[1:]:
-                if name not in static:
-                    bound.arguments[name] = host_array(name, bound.arguments[name])
+            given = bound.arguments
+            arrays = [name for name in list(given)[1:] if name not in static]
+            if any(isinstance(x, jax.Array) for x in jax.tree.leaves((robot, args, kwargs))):
+                given.update({name: jnp.asarray(given[name]) for name in arrays})
+                return fn(*bound.args, **bound.kwargs)
+            given.update({name: host_array(name, given[name]) for name in arrays})
             with jax.enable_x64(True):
                 # A copy, because the view of a JAX array cannot be written to.
                 return jax.tree.map(np.array, compiled(*bound.args, **bound.kwargs))

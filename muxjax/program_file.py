@@ -19,10 +19,14 @@ class ProgramFile(Strict):
 
 
 def save_program(program: Program, path: str | Path) -> None:
-    """Write a program as JSON."""
+    """Write a program as JSON; a file of that name is replaced whole or not at all."""
     envelope = ProgramFile(file_schema="muxjax/program/1", program=program)
     text = envelope.model_dump_json(by_alias=True, indent=2)
-    Path(path).write_text(text + "\n", encoding="utf-8")
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    torn = path.with_name(path.name + ".part")
+    torn.write_text(text + "\n", encoding="utf-8")
+    torn.replace(path)
 
 
 def load_program(path: str | Path) -> Program:

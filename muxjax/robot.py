@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from pathlib import Path
 
 import equinox as eqx
@@ -34,8 +35,20 @@ class Robot(eqx.Module):
     gear_ratio: Float[Array, ""]  # servo turns a wheel turn
     wheel_radius: Float[Array, ""]  # r_w [m]
     servo_speed: Float[Array, ""]  # omega [rad/s] at the servo's shaft
-    switch_time: Float[Array, ""]  # t_sw [s]
+    switch_time: Float[Array, ""]  # t_sw: repositioning and engagement [s]
+    engage_time: Float[Array, ""]  # engagement alone, where the drum need not turn [s]
     config: RobotConfig = eqx.field(static=True)
+
+    @property
+    def fingerprint(self) -> str:
+        """Hash over every value, by which plans, programs and boards name their robot.
+
+        A robot whose leaves were changed is another robot, though its configuration is the same.
+        """
+        digest = hashlib.sha256(self.config.fingerprint.encode())
+        for leaf in jax.tree.leaves(self):
+            digest.update(np.asarray(leaf, dtype=np.float64).tobytes())
+        return digest.hexdigest()[:16]
 
     @property
     def n_segments(self) -> int:
@@ -105,6 +118,7 @@ def robot_from_config(config: RobotConfig) -> Robot:
         wheel_radius=np.array(config.transmission.wheel_radius_m.value),
         servo_speed=np.array(config.servo.speed_rpm.value * 2 * np.pi / 60),
         switch_time=np.array(config.axial.switch_time_s.value),
+        engage_time=np.array(config.axial.engage_time_s.value),
         config=config,
     )
 

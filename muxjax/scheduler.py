@@ -69,16 +69,16 @@ def schedule(robot: Robot, plan: Plan) -> Program:
     Displacements whose sum over an instruction is below the problem's tolerance are dropped.
 
     Raises:
-        ValueError: The plan failed, belongs to another robot's tendon count, or has a step that the
+        ValueError: The plan failed, was made for another robot, or has a step that the
             problem's servos do not reach at its axial position.
     """
     problem = plan.problem
     if plan.status == "failed":
         raise ValueError(f"plan: {plan.method} found none ({plan.reason})")
-    if plan.displacements.shape[-1] != robot.n_tendons:
+    if plan.fingerprint != robot.fingerprint:
         raise ValueError(
-            f"plan: has {plan.displacements.shape[-1]} tendons, {robot.config.name} has "
-            f"{robot.n_tendons}"
+            f"plan: made for robot {plan.fingerprint}, this is {robot.config.name!r} "
+            f"({robot.fingerprint})"
         )
     moves = np.diff(plan.displacements, axis=0)
     _check_feasible(robot, moves != 0, plan.axial, problem.servos)
@@ -89,7 +89,7 @@ def schedule(robot: Robot, plan: Plan) -> Program:
             instructions.append(fused)
     return Program(
         robot=robot.config.name,
-        fingerprint=robot.config.fingerprint,
+        fingerprint=robot.fingerprint,
         start=tuple(plan.displacements[0].tolist()),
         target=tuple(problem.target.tolist()),
         axial=problem.axial,
@@ -160,8 +160,8 @@ def waypoints(robot: Robot, program: Program) -> list[Float[np.ndarray, "states 
 
 def check_same_robot(robot: Robot, program: Program) -> None:
     """Raise ValueError unless the program was made for this very robot."""
-    if program.fingerprint != robot.config.fingerprint:
+    if program.fingerprint != robot.fingerprint:
         raise ValueError(
             f"program: made for robot {program.robot!r} ({program.fingerprint}), this is "
-            f"{robot.config.name!r} ({robot.config.fingerprint})"
+            f"{robot.config.name!r} ({robot.fingerprint})"
         )

@@ -13,7 +13,8 @@ from matplotlib.animation import FuncAnimation, PillowWriter
 from matplotlib.figure import Figure
 
 from muxjax.kinematics import backbone
-from muxjax.metrics import Timeline, angles_at, timeline
+from muxjax.metrics import Timeline, timeline
+from muxjax.planning.motion import angles_at
 from muxjax.robot import Robot
 from muxjax.scheduler import Program
 from muxjax.tendons import configuration_from_tendons
@@ -183,11 +184,13 @@ def _draw_tendon(
 
 def _frame_arm(axes: Any, robot: Robot) -> None:
     reach = 1e3 * float(np.sum(robot.length))
-    base = 1e3 * robot.base[:3, 3]
+    # A cube about the middle of the straight arm, wherever its base points.
+    middle = 1e3 * robot.base[:3, 3] + 0.52 * reach * robot.base[:3, 2]
     half = 0.62 * reach
-    axes.set_xlim(base[0] - half, base[0] + half)
-    axes.set_ylim(base[1] - half, base[1] + half)
-    axes.set_zlim(base[2] - 0.1 * reach, base[2] + 1.14 * reach)
+    for set_limits, centre in zip(
+        (axes.set_xlim, axes.set_ylim, axes.set_zlim), middle, strict=True
+    ):
+        set_limits(centre - half, centre + half)
     axes.set_box_aspect((1, 1, 1))
     axes.set_xlabel("x [mm]", fontsize=8)
     axes.set_ylabel("y [mm]", fontsize=8)

@@ -5,12 +5,16 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
+from typing import get_args
 
 import numpy as np
 import pytest
 from PIL import Image
 
 from muxjax.cli import main
+from muxjax.cli.plans import Method
+from muxjax.planning import METHODS
+from muxjax.workspace import load_sweep
 
 
 @pytest.fixture
@@ -78,7 +82,10 @@ def test_plan_then_run(muxjax, tmp_path):
         (["ik", "--xyz-mm", "0", "0", "5000000"], "millimetres?"),
         (["plan"], "give either --xyz-mm"),
         (["plan", "--q-deg", "1", "1", "1", "1", "1", "1", "--servos", "7"], "servos 1 to 3"),
-        (["plan", "--xyz-mm", "0", "100", "550"], "not reached"),
+        (["ik", "--xyz-mm", "nan", "0", "0"], "position_m[1]: Input should be a finite number"),
+        (["ik", "--xyz-mm", "0", "0", "300", "--quat", "2", "0", "0", "0"], "norm 2, must be 1"),
+        (["plan", "--q-deg", "1", "1", "1", "1", "1", "1", "--preset", "x"], "no 'x' among"),
+        (["plan", "--q-deg", "1", "1", "1", "1", "1", "1", "--max-step-mm", "inf"], "max_step"),
         (["run", "nothing.json"], "nothing.json: cannot be read"),
         (["demo", "--task", "nothing"], "no 'nothing' among the shipped files"),
     ],
@@ -89,6 +96,50 @@ def test_bad_input_is_an_error_of_one_line(muxjax, arguments, message):
     assert out == ""
     assert message in err
     assert len(err.strip().splitlines()) == 1
+
+
+def test_a_plan_to_a_pose_out_of_reach_exits_with_1(muxjax):
+    code, out, err = muxjax("plan", "--xyz-mm", "0", "100", "550")
+    assert code == 1
+    assert out == ""
+    assert "not reached (OUT_OF_REACH)" in err
+
+
+def test_the_methods_of_the_command_line_are_the_planners():
+    assert set(get_args(Method)) == set(METHODS)
+
+
+def test_a_refusing_planner_does_not_end_the_demo(muxjax, tmp_path):
+    task = tmp_path / "task.yaml"
+    task.write_text(
+        "schema: muxjax/task/1\nname: one\ntargets:\n"
+        "  - {name: bent, position_m: [0.02901, 0.157179, 0.404852],"
+        " quaternion_wxyz: [0.97691724, 0.03292573, -0.07370458, 0.19777825]}\n"
+    )
+    command = ("demo", "--task", str(task), "--out", str(tmp_path), "--max-step-mm", "1")
+    code, text, _ = muxjax(*command, "--methods", "exact", "sequential", "--json")
+    outcomes = json.loads(text)
+    assert code == 0
+    assert all("GiB" in o["refusals"]["exact"] for o in outcomes)
+    assert all(o["moves"]["sequential"]["completed"] for o in outcomes)
+
+
+def test_sweep_writes_a_file_that_reads_back(muxjax, tmp_path):
+    code, out, _ = muxjax("sweep", "--samples", "2e5", "--out", str(tmp_path), "--json")
+    assert code == 0
+    found = load_sweep(tmp_path / "sweep.npz")
+    assert json.loads(out)["reach_radius_m"] == found.reach_radius
+    for name in ("dexterity.png", "convergence.png", "cut.png"):
+        assert (tmp_path / name).stat().st_size > 10_000
+    vary = ("sweep", "--vary", "segments[1].length_m=0.1,0.2", "--samples", "2e5", "--json")
+    code, out, _ = muxjax(*vary, "--out", str(tmp_path))
+    small, large = json.loads(out)
+    assert code == 0
+    assert small["reach_radius_m"] < large["reach_radius_m"]
+    for wrong in ("segments[1].length_m", "segments[9].length_m=1", "tendons.radius_m=x"):
+        code, _, err = muxjax("sweep", "--vary", wrong, "--out", str(tmp_path))
+        assert code == 2
+        assert wrong.split("=")[0][:8] in err
 
 
 def test_a_program_of_another_robot_does_not_run(muxjax, tmp_path):
@@ -125,5 +176,5 @@ def test_the_installed_command_starts():
         text=True,
         check=True,
     )
-    for command in ("demo", "fk", "ik", "plan", "run"):
+    for command in ("demo", "fk", "ik", "plan", "run", "sweep"):
         assert command in done.stdout

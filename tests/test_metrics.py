@@ -7,8 +7,9 @@ import pytest
 from test_planning import random_targets
 
 import muxjax
-from muxjax.metrics import angles_at, timeline
+from muxjax.metrics import timeline
 from muxjax.planning import Problem, plan
+from muxjax.planning.motion import angles_at
 
 
 @pytest.mark.parametrize("method", ["sequential", "reverse", "greedy", "exact"])
@@ -50,12 +51,12 @@ def test_time_is_eq_14(muxarm, rng):
         assert metrics.travel_m == pytest.approx(np.abs(target).sum(), rel=1e-9)
 
 
-def test_no_wait_at_the_axial_position_where_the_drum_stands(muxarm):
+def test_only_engagement_where_the_drum_stands(muxarm):
     target = np.zeros(9)
     target[0] = -0.01
     position = 1 + int(np.flatnonzero(muxarm.axial_map[:, 0] == 0)[0])
     moving = 0.01 / float(muxarm.tendon_speed)
-    for axial, waits in [(position, 0.0), (None, 3.0)]:
+    for axial, waits in [(position, 0.33), (None, 3.0)]:
         problem = Problem(np.zeros(9), target, servos=(1,), axial=axial)
         metrics = muxjax.evaluate(muxarm, muxjax.schedule(muxarm, plan(muxarm, problem)))
         assert metrics.time_s == pytest.approx(waits + moving)
@@ -66,6 +67,7 @@ def test_returning_to_straight_has_no_relative_peak(muxarm, rng):
     program = muxjax.schedule(muxarm, plan(muxarm, Problem(start, np.zeros(9), servos=(1,))))
     metrics = muxjax.evaluate(muxarm, program)
     assert np.isnan(metrics.overshoot_peak).all()
-    assert np.array(metrics.overshoot_peak_rad) == pytest.approx(
-        angles_at(muxarm, start[None])[0], abs=0.3
-    )
+    # It starts as bent as it ever is above straight, unless other segments bend it further.
+    begin = angles_at(muxarm, start[None])[0]
+    assert (np.array(metrics.bending_peak_rad) >= begin - 1e-9).all()
+    assert metrics.overshoot_peak_rad == pytest.approx(metrics.bending_peak_rad, abs=1e-6)

@@ -39,6 +39,16 @@ def test_from_a_bent_start_back_to_straight(muxarm, rng):
     assert move.position_error < 2e-4
 
 
+def test_the_board_agrees_with_eq_14_where_the_drum_already_stands(muxarm):
+    target = np.zeros(9)
+    target[0] = -0.003
+    position = 1 + int(np.flatnonzero(muxarm.axial_map[:, 0] == 0)[0])
+    for axial in (position, None, 9):
+        problem = muxjax.Problem(np.zeros(9), target, servos=(1,), axial=axial)
+        move = carry_out(muxarm, problem, muxjax.forward_kinematics(muxarm, np.zeros(6)))
+        assert move.run.duration_s == pytest.approx(move.metrics.time_s, rel=0.01)
+
+
 def test_a_task_goes_on_after_a_pose_out_of_reach(muxarm):
     task = shipped_task()
     outcomes = list(run_task(muxarm, task, servo_sets=[(1, 2, 3), (3,)], methods=["sequential"]))

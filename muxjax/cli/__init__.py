@@ -1,4 +1,4 @@
-"""The command line: ``muxjax demo | fk | ik | plan | run``.
+"""The command line: ``muxjax demo | fk | ik | plan | run | sweep``.
 
 A person types and reads millimetres and degrees; ``--json`` prints SI units for a machine. The exit
 code is 0 on success, 1 where a pose was not reached or a run did not complete, 2 on bad input.
@@ -6,6 +6,7 @@ code is 0 on success, 1 where a pose was not reached or a run did not complete, 
 
 from __future__ import annotations
 
+import io
 import os
 import sys
 from collections.abc import Callable, Sequence
@@ -18,6 +19,8 @@ import tyro
 from muxjax.cli.demo import demo
 from muxjax.cli.plans import plan, run
 from muxjax.cli.poses import fk, ik
+from muxjax.cli.sweep import sweep
+from muxjax.ik import IkError
 from muxjax.planning import PlanningError
 
 COMMANDS: dict[str, Callable[..., Any]] = {
@@ -26,17 +29,27 @@ COMMANDS: dict[str, Callable[..., Any]] = {
     "ik": ik,
     "plan": plan,
     "run": run,
+    "sweep": sweep,
 }
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Entry point of the ``muxjax`` command."""
     _keep_compilations()
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        sys.stdout.reconfigure(line_buffering=True)  # results appear as they come, in a pipe too
     try:
         code: int = tyro.extras.subcommand_cli_from_dict(
             COMMANDS, prog="muxjax", args=arguments, description=__doc__
         )
-    except (ValueError, PlanningError) as error:
+    except IkError as error:
+        print(f"muxjax: {error}", file=sys.stderr)
+        code = 1
+    except BrokenPipeError:
+        # The reader has seen enough; Python must not complain about it at exit either.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        code = 0
+    except (ValueError, PlanningError, OSError) as error:
         print(f"muxjax: {error}", file=sys.stderr)
         code = 2
     except KeyboardInterrupt:
@@ -50,3 +63,4 @@ def _keep_compilations() -> None:
     cache = Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "muxjax"
     jax.config.update("jax_compilation_cache_dir", str(cache))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
+    jax.config.update("jax_compilation_cache_max_size", 256 * 2**20)

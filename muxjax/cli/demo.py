@@ -17,6 +17,7 @@ from muxjax.cli.plans import Method
 from muxjax.config import TaskConfig, load_yaml, resolve
 from muxjax.ik import IkStatus
 from muxjax.pipeline import Outcome, run_task
+from muxjax.planning.problem import preset_weights
 from muxjax.robot import Robot, load_robot
 
 
@@ -44,6 +45,10 @@ def demo(
         out: Folder for the pictures.
         json: Print JSON in SI units instead of tables.
     """
+    if not methods:
+        raise ValueError("--methods: needs at least one planner")
+    preset_weights(preset)  # a wrong name is refused before any work
+    out.mkdir(parents=True, exist_ok=True)
     began = time.perf_counter()
     arm = load_robot(robot)
     targets = load_yaml(TaskConfig, resolve(task, "tasks"))
@@ -75,7 +80,7 @@ def demo(
 
 def _print_outcome(outcome: Outcome, *, first: bool) -> None:
     found = outcome.ik
-    if not outcome.moves:
+    if not found.converged:
         if first:
             console.print(
                 f"{outcome.target.name}: not reached "
@@ -112,6 +117,8 @@ def _print_outcome(outcome: Outcome, *, first: bool) -> None:
             f"{1e3 * move.position_error:.3f}",
             f"{np.degrees(move.orientation_error):.3f}",
         )
+    for method, reason in outcome.refusals.items():
+        table.add_row(method, reason.removeprefix(f"{method}: "))
     console.print(table)
 
 
@@ -120,8 +127,10 @@ def _outcome_document(outcome: Outcome) -> dict[str, Any]:
         "target": outcome.target.name,
         "servos": outcome.servos,
         "reached": bool(outcome.ik.converged),
+        "ik_status": IkStatus(int(outcome.ik.status)).name.lower(),
         "ik_position_error_m": float(outcome.ik.position_error),
         "ik_orientation_error_rad": float(outcome.ik.orientation_error),
+        "refusals": outcome.refusals,
         "moves": {
             method: {
                 "cost": move.plan.cost,
@@ -129,6 +138,7 @@ def _outcome_document(outcome: Outcome) -> dict[str, Any]:
                 "status": move.plan.status,
                 "metrics": dataclasses.asdict(move.metrics),
                 "completed": move.run.completed,
+                "reason": move.run.reason,
                 "duration_s": move.run.duration_s,
                 "position_error_m": move.position_error,
                 "orientation_error_rad": move.orientation_error,

@@ -77,6 +77,7 @@ def plan(
                 "status": found.status,
                 "cost": found.cost,
                 "lower_bound": found.lower_bound,
+                "gap": found.gap,
                 "metrics": dataclasses.asdict(metrics),
                 "program": dataclasses.asdict(program),
             }
@@ -101,6 +102,8 @@ def _problem(
     q_deg: tuple[float, ...] | None,
     fields: dict[str, Any],
 ) -> Problem:
+    if q_deg is not None and (rpy_deg is not None or quat is not None):
+        raise ValueError("plan: --q-deg fixes the orientation; leave out --rpy-deg and --quat")
     if xyz_mm is not None and q_deg is None:
         return problem_for_pose(arm, pose_argument(xyz_mm, rpy_deg, quat), **fields)[1]
     if q_deg is not None and xyz_mm is None:

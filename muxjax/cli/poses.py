@@ -6,10 +6,11 @@ from typing import Annotated
 
 import numpy as np
 import tyro
+from pydantic import ValidationError
 from rich.table import Table
 
 from muxjax.cli.output import console, pose_document, print_json, row_of
-from muxjax.config import TargetConfig
+from muxjax.config import ConfigError, TargetConfig, explain
 from muxjax.ik import IkStatus, solve_ik
 from muxjax.kinematics import check_configuration, forward_kinematics
 from muxjax.pipeline import target_pose
@@ -59,12 +60,15 @@ def pose_argument(xyz_mm: Xyz, rpy_deg: Xyz | None, quat: Quaternion | None) -> 
     """Pose typed as millimetres and either degrees or a quaternion; upright by default."""
     if rpy_deg is None and quat is None:
         rpy_deg = (0.0, 0.0, 0.0)
-    target = TargetConfig(
-        name="pose",
-        position_m=(xyz_mm[0] / 1e3, xyz_mm[1] / 1e3, xyz_mm[2] / 1e3),
-        rpy_deg=rpy_deg,
-        quaternion_wxyz=quat,
-    )
+    try:
+        target = TargetConfig(
+            name="pose",
+            position_m=(xyz_mm[0] / 1e3, xyz_mm[1] / 1e3, xyz_mm[2] / 1e3),
+            rpy_deg=rpy_deg,
+            quaternion_wxyz=quat,
+        )
+    except ValidationError as error:
+        raise ConfigError(explain(error)) from None
     return target_pose(target)
 
 

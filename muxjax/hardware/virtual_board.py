@@ -84,7 +84,7 @@ class VirtualBoard:
         self.mechanics = Mechanics(robot, start, _slot(robot, axial))
         self.limits = displacement_range(robot) + np.array([-RANGE_MARGIN_M, RANGE_MARGIN_M])
         self.facing = robot.axial_map.tolist()  # tendon that each servo meets, [slot][servo]
-        self.words = fingerprint_words(robot.config.fingerprint)
+        self.words = fingerprint_words(robot.fingerprint)
         self.state = BoardState.SILENT
         self.faults = Fault(0)
         self.refused: dict[Refusal, int] = dict.fromkeys(Refusal, 0)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Callable, Mapping
 from typing import Any
 
@@ -59,10 +60,8 @@ def plan(robot: Robot, problem: Problem, method: str = "exact", **options: Any) 
     """
     if method not in METHODS:
         raise ValueError(f"method: must be one of {', '.join(METHODS)}; found {method!r}")
+    unknown = set(options) - set(inspect.signature(METHODS[method]).parameters)
+    if unknown:
+        raise ValueError(f"{method}: has no option {', '.join(sorted(unknown))}")
     check_problem(robot, problem)
-    try:
-        return METHODS[method](Lattice(robot, problem), **options)
-    except TypeError as error:
-        if options and "unexpected keyword" in str(error):
-            raise ValueError(f"{method}: {error}") from None
-        raise
+    return METHODS[method](Lattice(robot, problem), **options)

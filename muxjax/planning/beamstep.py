@@ -51,8 +51,8 @@ def beamstep(lattice: Lattice, *, width: int = 64, value_fn: ValueFunction | Non
     Raises:
         ValueError: A width below 1.
     """
-    if width < 1:
-        raise ValueError(f"width: must be at least 1, found {width}")
+    if not isinstance(width, int) or width < 1:
+        raise ValueError(f"width: must be a whole number, at least 1, found {width!r}")
     bound = AdmissibleBound(lattice)
     incumbent = min((rule(lattice) for rule in (sequential, reverse, greedy)), key=lambda p: p.cost)
     best_cost, best_steps = incumbent.cost, None
@@ -60,7 +60,7 @@ def beamstep(lattice: Lattice, *, width: int = 64, value_fn: ValueFunction | Non
     levels = [_root(lattice)]
     while levels[-1].remaining.any():
         expansions += len(levels[-1].cost)
-        level = _deduplicated(_children(lattice, levels[-1]))
+        level = _deduplicated(_children(lattice, levels[-1], first=len(levels) == 1))
         done = ~level.remaining.any(axis=1)
         if done.any() and level.cost[done].min() < best_cost:
             best_cost = float(level.cost[done].min())
@@ -74,6 +74,8 @@ def beamstep(lattice: Lattice, *, width: int = 64, value_fn: ValueFunction | Non
         cut_off = min(cut_off, float(np.min(promise[ranked[width:]], initial=np.inf)))
         levels.append(level.take(ranked[:width]))
     optimal = cut_off >= best_cost
+    if best_steps is None and incumbent.status == "failed":
+        return replace(incumbent, method="beamstep", expansions=expansions)
     if best_steps is None:
         return replace(
             incumbent,
@@ -102,13 +104,13 @@ def _root(lattice: Lattice) -> _Level:
     )
 
 
-def _children(lattice: Lattice, level: _Level) -> _Level:
-    """Every possible step from every plan of a level."""
+def _children(lattice: Lattice, level: _Level, *, first: bool) -> _Level:
+    """Every possible step from every plan of a level; ``first`` if these plans are still empty."""
     stops, _ = lattice.actions
     possible, moves = lattice.expand(level.remaining)
     row, action = np.nonzero(possible)
     moved, stop = moves[row, action], stops[action]
-    both = lattice.costs(level.remaining[row], moved)
+    both = lattice.costs(level.remaining[row], moved, first=first)
     return _Level(
         remaining=level.remaining[row] - moved,
         stop=stop,
@@ -166,8 +168,8 @@ def beamstep_printed(lattice: Lattice, *, width: int = 64, max_expansions: int =
     Raises:
         ValueError: A width below 1.
     """
-    if width < 1:
-        raise ValueError(f"width: must be at least 1, found {width}")
+    if not isinstance(width, int) or width < 1:
+        raise ValueError(f"width: must be a whole number, at least 1, found {width!r}")
     if lattice.problem.action_set != "all":
         lattice = Lattice(lattice.robot, replace(lattice.problem, action_set="all"))
     tie = count()
@@ -175,7 +177,12 @@ def beamstep_printed(lattice: Lattice, *, width: int = 64, max_expansions: int =
     for expansions in range(max_expansions):
         heap = heapq.nsmallest(width, heap)  # sorted, hence again a heap
         if not heap:
-            break
+            return failed(
+                lattice,
+                method="beamstep_printed",
+                reason=f"the heap of width {width} ran empty",
+                expansions=expansions,
+            )
         _, _, node = heapq.heappop(heap)
         if not node.remaining.any():
             return replay(
@@ -201,10 +208,12 @@ def _successors(lattice: Lattice, node: _Node) -> list[_Node]:
             parent=np.zeros(1, dtype=np.int64),
             moves=np.zeros((1, len(node.remaining)), dtype=bool),
         ),
+        first=not node.steps,
     )
     return [
         _Node(remaining, int(stop), float(cost), (*node.steps, Step(int(stop), moves)))
         for remaining, stop, cost, moves in zip(
             level.remaining, level.stop, level.cost, level.moves, strict=True
         )
+        if np.isfinite(cost)
     ]

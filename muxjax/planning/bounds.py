@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from functools import cached_property
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from muxjax.planning.lattice import Lattice
+from muxjax.planning.motion import angles_at
 from muxjax.planning.problem import TERMS
-
-Bound = Callable[[Int[np.ndarray, "N SJ"], Int[np.ndarray, " N"]], Float[np.ndarray, " N"]]
 
 
 class AdmissibleBound:
@@ -19,9 +17,10 @@ class AdmissibleBound:
 
     - travel: the residuals, exactly, since moves never turn back;
     - switches: stops still needed by the unfinished tendons that the present stop does not reach;
-    - time: those stops' repositioning, and the motion if every servo could always work;
+    - time: those stops' repositioning, and the motion if every servo could always work (a first
+      engagement without repositioning is left out);
     - bending: the last step ends at the target's bending;
-    - overshoot and terms of a user: nothing.
+    - overshoot and terms of a user: nothing, which is a bound because no term may be negative.
     """
 
     def __init__(self, lattice: Lattice) -> None:
@@ -59,7 +58,7 @@ class AdmissibleBound:
 
     @cached_property
     def _end_angles(self) -> Float[np.ndarray, " S"]:
-        return self._lattice.angles(self._end)
+        return angles_at(self._lattice.robot, self._end[None])[0]
 
     def _by_layer(self, values: np.ndarray) -> np.ndarray:
         robot = self._lattice.robot

@@ -9,13 +9,14 @@ from jaxtyping import Float, Int
 
 from muxjax.planning.lattice import Lattice
 from muxjax.planning.problem import Plan, PlanningError
-from muxjax.planning.replay import Step, replay
+from muxjax.planning.replay import Step, failed, replay
 
 DEFAULT_MEMORY = 2 * 2**30  # [bytes]
-_CHUNK = 65536
-# One state: its value at every stop (float64), its index in the sorted order, a share of the
-# temporaries of one chunk.
+# Beside its values (float64 at every stop), a state has its steps to go and its place in the order.
 _BYTES_PER_STATE = 24
+# A possible step of a state while its chunk is worked on: masks and states, by tendon.
+_BYTES_PER_STEP_AND_TENDON = 48
+_CHUNK_BYTES = 64 * 2**20
 
 
 def exact(lattice: Lattice, *, memory_limit: int = DEFAULT_MEMORY) -> Plan:
@@ -30,7 +31,8 @@ def exact(lattice: Lattice, *, memory_limit: int = DEFAULT_MEMORY) -> Plan:
         memory_limit: Most memory that the table may take [bytes].
 
     Raises:
-        PlanningError: The table does not fit; the message says how large it would be.
+        PlanningError: The table does not fit, and the message says how large it would be; or a
+            cost term is negative, or lower with a repositioning than without.
     """
     solver = _Table(lattice, memory_limit)
     solver.fill()
@@ -44,7 +46,10 @@ class _Table:
         self.lattice = lattice
         self.shape = lattice.steps + 1
         states, stops = math.prod(int(n) for n in self.shape), len(lattice.reach)
-        needed = states * (8 * stops + _BYTES_PER_STATE)
+        actions, tendons = lattice.actions[1].shape
+        a_state = actions * tendons * _BYTES_PER_STEP_AND_TENDON
+        self.chunk = min(max(1, _CHUNK_BYTES // a_state), states)
+        needed = states * (8 * stops + _BYTES_PER_STATE) + self.chunk * a_state
         if needed > memory_limit:
             raise PlanningError(
                 f"exact: {states:.3g} states at {stops} stops need {needed / 2**30:.3g} GiB, the "
@@ -68,13 +73,13 @@ class _Table:
         layers = np.split(order, np.cumsum(np.bincount(to_go))[:-1])
         self.value[layers[0]] = 0.0
         for layer in layers[1:]:
-            for i in range(0, len(layer), _CHUNK):
-                chunk = layer[i : i + _CHUNK]
+            for i in range(0, len(layer), self.chunk):
+                chunk = layer[i : i + self.chunk]
                 stay, switch = self.action_values(chunk)
                 self.value[chunk] = self.best_by_stop(stay, switch)
 
     def action_values(
-        self, index: Int[np.ndarray, " N"]
+        self, index: Int[np.ndarray, " N"], *, first: bool = False
     ) -> tuple[Float[np.ndarray, "N G"], Float[np.ndarray, "N G"]]:
         """Cost to go through each action, without and with a repositioning before it."""
         remaining = self.remaining(index)
@@ -84,12 +89,11 @@ class _Table:
         self.expansions += len(index)
         moved = moves[state, action]
         after = self.value[index[state] - moved @ self.strides, stops[action]]
+        costs = self.lattice.costs(remaining[state], moved, first=first)
+        if (costs[:, 1] < costs[:, 0]).any():
+            raise PlanningError("exact: a cost term pays for repositioning, which has no optimum")
         through = np.full((2, len(index), len(masks)), np.inf)
-        through[:, state, action] = self.lattice.costs(remaining[state], moved).T + after
-        if (through[1] < through[0]).any():
-            raise PlanningError(
-                "exact: a cost term pays for repositioning; it must not be negative"
-            )
+        through[:, state, action] = costs.T + after
         return through[0], through[1]
 
     def best_by_stop(
@@ -109,7 +113,14 @@ class _Table:
         steps: list[Step] = []
         expansions = self.expansions
         while index:
-            stay, switch = self.action_values(np.array([index]))
+            stay, switch = self.action_values(np.array([index]), first=not steps)
+            if not np.isfinite(min(stay.min(), switch.min())):
+                return failed(
+                    self.lattice,
+                    method="exact",
+                    reason="every order passes through a state that is not defined",
+                    expansions=expansions,
+                )
             action = int(np.argmin(np.where(stops == stop, stay[0], switch[0])))
             moves = masks[action] & (self.remaining(np.array([index]))[0] > 0)
             stop = int(stops[action])

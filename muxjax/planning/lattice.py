@@ -17,7 +17,14 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from muxjax.planning.motion import bending_angles
-from muxjax.planning.problem import Problem, Term, clipped_move, step, transition_cost
+from muxjax.planning.problem import (
+    PlanningError,
+    Problem,
+    Term,
+    clipped_move,
+    step,
+    transition_cost,
+)
 from muxjax.precision import pad_rows
 from muxjax.robot import Robot
 
@@ -108,18 +115,38 @@ class Lattice:
         return np.all(moves == masks, axis=-1), moves
 
     def costs(
-        self, remaining: Int[np.ndarray, "N SJ"], moves: Bool[np.ndarray, "N SJ"]
+        self,
+        remaining: Int[np.ndarray, "N SJ"],
+        moves: Bool[np.ndarray, "N SJ"],
+        *,
+        first: bool = False,
     ) -> Float[np.ndarray, "N 2"]:
-        """Cost of moving tendons one step, without and with an axial repositioning before it."""
+        """Cost of moving tendons one step, without and with an axial repositioning before it.
+
+        A step into a state that the formulas do not define (tendons wound in by more than a
+        segment's length), or whose cost is not finite, costs infinitely much.
+
+        Args:
+            remaining: States before the step.
+            moves: Tendons that move.
+            first: These are first steps: without repositioning, clutches still engage.
+
+        Raises:
+            PlanningError: A negative cost, on which no bound could rest.
+        """
         before = self.displacements(remaining)
-        parts = [
-            self._costs_of_batch(before[i : i + _LARGEST_BATCH], moves[i : i + _LARGEST_BATCH])
-            for i in range(0, len(before), _LARGEST_BATCH)
-        ]
-        return np.concatenate(parts) if parts else np.zeros((0, 2))
+        starts = range(0, len(before), _LARGEST_BATCH)
+        parts = [np.zeros((0, 2))]
+        for batch in (slice(i, i + _LARGEST_BATCH) for i in starts):
+            parts.append(self._costs_of_batch(before[batch], moves[batch], first))
+        costs = np.concatenate(parts)
+        costs = np.where(np.isfinite(costs), costs, np.inf)
+        if (costs < 0).any():
+            raise PlanningError("a cost term is negative; terms must be at least 0")
+        return costs
 
     def _costs_of_batch(
-        self, before: Float[np.ndarray, "N SJ"], moves: Bool[np.ndarray, "N SJ"]
+        self, before: Float[np.ndarray, "N SJ"], moves: Bool[np.ndarray, "N SJ"], first: bool
     ) -> Float[np.ndarray, "N 2"]:
         with jax.enable_x64(True):
             costs = _batch_costs(
@@ -130,13 +157,9 @@ class Lattice:
                 pad_rows(moves.astype(np.float64)),
                 self.problem.target,
                 np.float64(self.max_step),
+                np.float64(first),
             )
             return np.asarray(costs)[: len(before)]
-
-    def angles(self, displacements: Float[np.ndarray, " SJ"]) -> Float[np.ndarray, " S"]:
-        """Bending angles [rad] of displacements [m]."""
-        with jax.enable_x64(True):
-            return np.asarray(_angles(self.robot, displacements))
 
 
 @partial(jax.jit, static_argnums=1)
@@ -148,17 +171,19 @@ def _batch_costs(
     chosen: Float[Array, "N SJ"],
     target: Float[Array, " SJ"],
     max_step: Float[Array, ""],
+    first: Float[Array, ""],
 ) -> Float[Array, "N 2"]:
     goal = bending_angles(robot, target)
     move = clipped_move(before, target, chosen, max_step)
 
     def cost(repositions: float) -> Float[Array, " N"]:
         flags = jnp.full(before.shape[0], repositions)
-        return transition_cost(robot, terms, weights, step(robot, before, move, flags, goal))
+        engages = (1.0 - flags) * first
+        return transition_cost(
+            robot, terms, weights, step(robot, before, move, flags, engages, goal)
+        )
 
-    return jnp.stack([cost(0.0), cost(1.0)], axis=-1)
-
-
-@jax.jit
-def _angles(robot: Robot, displacements: Float[Array, " SJ"]) -> Float[Array, " S"]:
-    return bending_angles(robot, displacements)
+    # A state that is not defined makes its step impossible, whatever the terms look at.
+    defined = jnp.all(jnp.isfinite(bending_angles(robot, before + move)), axis=-1)
+    both = jnp.stack([cost(0.0), cost(1.0)], axis=-1)
+    return jnp.where(defined[:, None], both, jnp.inf)

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float
 
+from muxjax.precision import pad_rows
 from muxjax.robot import Robot
 from muxjax.tendons import bending_from_displacements
 
@@ -29,6 +30,17 @@ def bending_angles(robot: Robot, displacements: Float[Array, "*n SJ"]) -> Float[
     u = jnp.sum(b * b, axis=-1)
     straight = u == 0.0  # the root's slope is infinite there; the angle's slope is taken as zero
     return jnp.where(straight, 0.0, jnp.sqrt(jnp.where(straight, 1.0, u)))
+
+
+def angles_at(robot: Robot, displacements: Float[np.ndarray, "P SJ"]) -> Float[np.ndarray, "P S"]:
+    """``bending_angles`` on the host, in float64."""
+    with jax.enable_x64(True):
+        return np.asarray(_angles(robot, pad_rows(displacements)))[: len(displacements)]
+
+
+@jax.jit
+def _angles(robot: Robot, displacements: Float[Array, "P SJ"]) -> Float[Array, "P S"]:
+    return bending_angles(robot, displacements)
 
 
 def leg_time(robot: Robot, move: Float[Array, "*n SJ"]) -> Float[Array, "*n"]:

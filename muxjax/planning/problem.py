@@ -9,9 +9,10 @@ function of the transition.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
-from functools import lru_cache
+from functools import cached_property
+from types import MappingProxyType
 from typing import Annotated, Any, Literal, NamedTuple
 
 import equinox as eqx
@@ -31,6 +32,10 @@ from muxjax.tendons import check_displacements, configuration_from_tendons
 Array = jax.Array | np.ndarray
 
 
+def _is_number(value: object) -> bool:
+    return isinstance(value, (int, float, np.number)) and math.isfinite(value)
+
+
 class PlanningError(RuntimeError):
     """A planner that cannot do what was asked; the message says why and what would work."""
 
@@ -41,7 +46,8 @@ class Transition(NamedTuple):
     before: Float[Array, "*n SJ"]  # displacements [m]
     after: Float[Array, "*n SJ"]  # [m]
     repositions: Float[Array, "*n"]  # 1 where the axial motor moves first, else 0
-    wait: Float[Array, "*n"]  # time spent at `before` until the tendons move [s]
+    wait: Float[Array, "*n"]  # time spent at `before` until the tendons move [s]: t_sw, or the
+    # engagement alone for a first step at the axial position where the drum stands, or 0
     goal: Float[Array, "*#n S"]  # bending angles of the target [rad]
 
 
@@ -91,8 +97,7 @@ class PlannerConfig(Strict):
     weights: dict[str, Sourced[Annotated[float, Field(ge=0)]]]
 
 
-@lru_cache(maxsize=32)
-def preset_weights(name_or_path: str) -> Mapping[str, float]:
+def preset_weights(name_or_path: str) -> dict[str, float]:
     """Weights of a shipped preset by name, or of a YAML file by path.
 
     Raises:
@@ -114,7 +119,8 @@ class Problem:
         tolerance: The target is reached when no tendon is further off than this [m].
         preset: Name of a shipped set of weights, or the path of a YAML file.
         weights: Weights by term name instead of a preset.
-        terms: Your own cost terms by name, beside those of ``TERMS``.
+        terms: Your own cost terms by name, beside those of ``TERMS``; none may be negative, and
+            one that is not finite forbids its step.
         axial: Axial position now, if known; otherwise the first step repositions.
         action_set: ``"subsets"``: any non-empty subset of the tendons that the servos reach at an
             axial position; ``"all"``: all of them that still have to move (the paper's).
@@ -140,37 +146,57 @@ class Problem:
             value = host_array(f"Problem.{name}", getattr(self, name))
             if value.ndim != 1:
                 raise ValueError(f"Problem.{name}: must be a vector, found shape {value.shape}")
+            value.setflags(write=False)
             object.__setattr__(self, name, value)
-        object.__setattr__(self, "servos", tuple(int(s) for s in self.servos))
-        if not self.servos or len(set(self.servos)) < len(self.servos):
+        object.__setattr__(self, "servos", self._checked_servos())
+        if not (_is_number(self.tolerance) and self.tolerance > 0):
+            raise ValueError(f"Problem.tolerance: must be above 0, found {self.tolerance!r}")
+        if self.max_step is not None and not (
+            _is_number(self.max_step) and self.max_step > self.tolerance
+        ):
             raise ValueError(
-                f"Problem.servos: must be a non-empty set of servos, found {self.servos}"
+                f"Problem.max_step: must be finite and above the tolerance {self.tolerance:g} m, "
+                f"or None, found {self.max_step!r}"
             )
-        if not (math.isfinite(self.tolerance) and self.tolerance > 0):
-            raise ValueError(f"Problem.tolerance: must be above 0, found {self.tolerance}")
-        if self.max_step is not None and not self.max_step > self.tolerance:
-            raise ValueError(
-                f"Problem.max_step: must be above the tolerance {self.tolerance:g} m, "
-                f"found {self.max_step}"
-            )
+        if self.axial is not None and not isinstance(self.axial, (int, np.integer)):
+            raise ValueError(f"Problem.axial: must be a whole number or None, found {self.axial!r}")
         if self.action_set not in ("subsets", "all"):
             raise ValueError(
                 f"Problem.action_set: must be 'subsets' or 'all', found {self.action_set!r}"
             )
         self._check_weights()
 
+    def _checked_servos(self) -> tuple[int, ...]:
+        servos: tuple[object, ...] = ()
+        if isinstance(self.servos, Iterable):
+            servos = tuple(self.servos)
+        whole = all(isinstance(s, (int, np.integer)) for s in servos)
+        if not whole or not servos or len(set(servos)) < len(servos):
+            raise ValueError(
+                f"Problem.servos: must be a non-empty set of servos, found {self.servos!r}"
+            )
+        return tuple(int(s) for s in self.servos)
+
     def _check_weights(self) -> None:
+        if not isinstance(self.preset, str):
+            raise ValueError(f"Problem.preset: must be a name or a path, found {self.preset!r}")
         known = {**TERMS, **self.terms}
         for name, weight in self.cost_weights.items():
             if name not in known:
                 raise ValueError(f"Problem.weights: no term {name!r} among {sorted(known)}")
-            if not (math.isfinite(weight) and weight >= 0):
-                raise ValueError(f"Problem.weights[{name!r}]: must be at least 0, found {weight}")
+            if not (_is_number(weight) and weight >= 0):
+                raise ValueError(f"Problem.weights[{name!r}]: must be at least 0, found {weight!r}")
+        if not self.cost_weights:
+            raise ValueError("Problem.weights: needs at least one term")
+        unweighted = set(self.terms) - set(self.cost_weights)
+        if unweighted:
+            raise ValueError(f"Problem.terms: {sorted(unweighted)} have no entry in weights")
 
-    @property
+    @cached_property
     def cost_weights(self) -> Mapping[str, float]:
         """Weight of each cost term."""
-        return preset_weights(self.preset) if self.weights is None else self.weights
+        weights = preset_weights(self.preset) if self.weights is None else dict(self.weights)
+        return MappingProxyType(weights)
 
     @property
     def weighted_terms(self) -> tuple[tuple[str, Term], ...]:
@@ -197,13 +223,19 @@ class Plan(eqx.Module):
     lower_bound: float  # no plan of this action set costs less
     expansions: int  # states whose steps were evaluated
     problem: Problem = eqx.field(static=True)
+    fingerprint: str = eqx.field(static=True)  # of the robot it was made for
     method: str = eqx.field(static=True)
     status: Literal["optimal", "feasible", "failed"] = eqx.field(static=True)
     reason: str = eqx.field(static=True, default="")
 
     @property
     def gap(self) -> float:
-        """Certified relative distance to the optimum: (cost - lower_bound) / cost, 0 if free."""
+        """Certified relative distance to the optimum: (cost - lower_bound) / cost.
+
+        0 for a plan that costs nothing, 1 for one that failed.
+        """
+        if not math.isfinite(self.cost):
+            return 1.0
         return (self.cost - self.lower_bound) / self.cost if self.cost > 0 else 0.0
 
     @property
@@ -253,14 +285,24 @@ def step(
     displacements: Float[Array, "*n SJ"],
     move: Float[Array, "*n SJ"],
     repositions: Float[Array, "*n"],
+    engages: Float[Array, "*n"],
     goal: Float[Array, "*#n S"],
 ) -> Transition:
-    """The one transition rule: wait for the axial motor if it moves, then move the tendons."""
+    """The one transition rule: reposition and engage as needed, then move the tendons.
+
+    Args:
+        robot: The arm.
+        displacements: Before the step [m].
+        move: Displacement of each tendon [m].
+        repositions: 1 where the axial motor moves first, else 0.
+        engages: 1 where clutches engage at the position where the drum already stands, else 0.
+        goal: Bending angles of the target [rad].
+    """
     return Transition(
         before=displacements,
         after=displacements + move,
         repositions=repositions,
-        wait=repositions * robot.switch_time,
+        wait=repositions * robot.switch_time + engages * robot.engage_time,
         goal=goal,
     )
 

@@ -30,7 +30,7 @@ def replay(
     expansions: int = 0,
     optimal: bool = False,
 ) -> Plan:
-    """The Plan of a sequence of steps that ends at the target, with its cost.
+    """The Plan of a sequence of steps that ends at the target, with its cost, or a failed one.
 
     Every planner's result is priced here, so that their costs can be compared to the last bit.
     Axial positions are the planner's, or those with the fewest repositionings where that is
@@ -46,23 +46,31 @@ def replay(
     """
     moved = np.array([s.moves for s in steps], dtype=np.int64).reshape(-1, lattice.robot.n_tendons)
     remaining = lattice.steps - np.concatenate([0 * lattice.steps[None], np.cumsum(moved, axis=0)])
-    if remaining[-1].any():
-        raise AssertionError(f"{method}: the plan ends at remaining steps {remaining[-1]}")
+    displacements = lattice.displacements(remaining)
+    off = float(np.max(np.abs(displacements[-1] - lattice.problem.target)))
+    # The slack is for start + (target - start) != target in floating point.
+    if remaining[-1].any() or off > lattice.problem.tolerance * (1 + 1e-9):
+        raise AssertionError(f"{method}: the plan ends {off:g} m from the target")
     own = lattice.axial_of(np.array([s.stop for s in steps], dtype=np.int64))
     both = lattice.costs(remaining[:-1], moved > 0)
+    both[:1] = lattice.costs(remaining[:-1][:1], moved[:1] > 0, first=True)
     cost, axial = min(
         ((_cost(lattice, both, axial), axial) for axial in (own, _fewest(lattice, moved > 0, own))),
         key=lambda priced: priced[0],
     )
+    if not np.isfinite(cost):
+        reason = "it passes through a state that is not defined, or whose cost is not finite"
+        return failed(lattice, method=method, reason=reason, expansions=expansions)
     if lower_bound is None:
         lower_bound = float(AdmissibleBound(lattice)(*_start(lattice))[0])
     return Plan(
-        displacements=lattice.displacements(remaining),
+        displacements=displacements,
         axial=axial,
         cost=cost,
         lower_bound=cost if optimal else min(cost, lower_bound),
         expansions=expansions,
         problem=lattice.problem,
+        fingerprint=lattice.robot.fingerprint,
         method=method,
         status="optimal" if optimal else "feasible",
     )
@@ -90,6 +98,7 @@ def failed(lattice: Lattice, *, method: str, reason: str, expansions: int) -> Pl
         lower_bound=float(AdmissibleBound(lattice)(*_start(lattice))[0]),
         expansions=expansions,
         problem=lattice.problem,
+        fingerprint=lattice.robot.fingerprint,
         method=method,
         status="failed",
         reason=reason,

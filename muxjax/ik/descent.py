@@ -9,37 +9,34 @@ error (end-effector frame), J has the same rows, and b is the Cartesian bending,
 segments are ordinary points. The gain starts at 1, halves on a step that does not descend and
 doubles back on one that does; the bending limits are enforced after every update.
 
-Descents from several starts run together (``descend_from_starts``, traceable); the host face
-``solve_ik`` repeats such rounds for the poses that are still unsolved.
+Descents from several starts run together (``descend_from_starts``, traceable);
+``solve_by_descent`` repeats such rounds for the poses that are still unsolved.
 """
 
 from __future__ import annotations
 
-from enum import IntEnum
 from typing import Any, NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int, PRNGKeyArray
 
+from muxjax.ik.checks import distance_from_root, orthonormalised, reach
+from muxjax.ik.result import IkResult, IkStatus
 from muxjax.kinematics import (
     bending_from_configuration,
     bending_jacobian,
-    check_configuration,
     configuration_from_bending,
     pose_from_bending,
 )
-from muxjax.precision import check_last_axis, host_array
+from muxjax.precision import check_last_axis
 from muxjax.robot import Robot
 
 Array = jax.Array | np.ndarray
 
 POSITION_TOLERANCE = 1e-10  # [m], M IV-A2
 ORIENTATION_TOLERANCE = 1e-10  # [rad], M IV-A2; judged on the true angle, never on the vee
-ROTATION_TOLERANCE = 1e-5  # largest entry of R'R - 1 taken for rounding and orthonormalised
-UNIT_SUSPICION = 10.0  # a pose farther away than this many arm lengths is taken for millimetres
 STARTS = 128  # descents a pose at most
 STARTS_PER_ROUND = 8
 ITERATIONS = 32  # trial steps a descent at most
@@ -57,172 +54,31 @@ TILT = 0.1  # [rad] by which the second start leaves the reference, each segment
 _BUCKETS = (1, 16, 256)
 
 
-class IkStatus(IntEnum):
-    """How a solve ended."""
-
-    CONVERGED = 0  # both errors are below their tolerances
-    NOT_CONVERGED = 1  # no start reached the pose; the closest found is inside the limits
-    LIMITED = 2  # the same, and the closest found lies on the limits in ``binding_limit``
-    OUT_OF_REACH = 3  # the position is farther from the root than the arm and its tool are long
-
-
-class IkError(ValueError):
-    """A pose that was not reached, raised on request by ``IkResult.check``."""
-
-
-class IkResult(eqx.Module):
-    """Configurations found for poses of any leading batch axes.
-
-    Where ``converged`` is false, q is the closest found in the merit
-    (position error / total length)^2 + orientation_error^2: a residual, not a solution.
-    """
-
-    q: Float[Array, "*batch dof"]  # (theta_1, phi_1, ...) [rad], within the limits
-    position_error: Float[Array, "*batch"]  # [m]
-    orientation_error: Float[Array, "*batch"]  # angle of the remaining rotation [rad]
-    converged: Bool[Array, "*batch"]
-    status: Int[Array, "*batch"]  # IkStatus
-    binding_limit: Bool[Array, "*batch S"]  # segments bent to their limit
-
-    def check(self) -> IkResult:
-        """This result, if every pose was reached.
-
-        Raises:
-            IkError: Names the first batch row that was not, its residual and the binding limits.
-        """
-        failed = np.argwhere(~np.asarray(self.converged))
-        if not len(failed):
-            return self
-        row = tuple(int(i) for i in failed[0])
-        bound = [int(i) + 1 for i in np.flatnonzero(np.asarray(self.binding_limit[row]))]
-        raise IkError(
-            f"pose{list(row) if row else ''}: not reached "
-            f"({IkStatus(int(self.status[row])).name}); the closest found is "
-            f"{1e3 * float(self.position_error[row]):.4g} mm and "
-            f"{np.degrees(float(self.orientation_error[row])):.4g} degrees off"
-            + (f", segments {bound} at their bending limit" if bound else "")
-        )
-
-
-def solve_ik(
+def solve_by_descent(
     robot: Robot,
-    pose: Float[Array, "*batch 4 4"],
-    *,
-    q0: Float[Array, "*#batch dof"] | None = None,
-    key: PRNGKeyArray | None = None,
-    starts: int = STARTS,
+    poses: Float[np.ndarray, "rows 4 4"],
+    reference: Float[np.ndarray, "rows dof"],
+    key: PRNGKeyArray | None,
+    starts: int,
 ) -> IkResult:
-    """One configuration for each tool pose (M Eq. 3), in float64.
+    """One configuration for each pose by the paper's method.
 
-    The first descents start at the reference (q0, or the straight arm) and beside it, the others
-    at random within the limits. Rounds of ``STARTS_PER_ROUND`` go on until one has a solution;
-    of those it has, the one nearest to the reference in Cartesian bending is returned. An arm of
-    more than three segments uses its freedom to stay near the reference as well.
-
-    All rows of a batch share their random starts: a row's answer does not depend on the others.
-
-    Args:
-        robot: The arm; its base and tool frames are included.
-        pose: Homogeneous transforms [m], any leading batch axes. Rotations that are off by
-            rounding (``ROTATION_TOLERANCE``) are orthonormalised first.
-        q0: Configuration [rad] to stay near, broadcast against the batch of poses.
-        key: JAX random key of the starts; ``jax.random.key(0)`` by default, so that the same
-            call gives the same answer.
-        starts: Descents a pose at most.
-
-    Returns:
-        NumPy float64 arrays. A pose that was not reached has ``converged`` false.
-
-    Inside a trace the values cannot be checked, all starts run as one round and the result holds
-    JAX arrays; NaN in gives ``converged`` false.
-
-    Raises:
-        ValueError: Wrong shape, not finite, not a rotation, a position so far away that its unit
-            must be wrong, q0 beyond the limits, or starts below 1; names the row of the batch.
-            Also when traced in float32: set jax.config.update("jax_enable_x64", True).
+    The first descents start at the reference and beside it, the others at random within the
+    limits. Rounds of ``STARTS_PER_ROUND`` go on until one has a solution; of those it has, the
+    one nearest to the reference in Cartesian bending is returned. All rows share their random
+    starts: a row's answer does not depend on the others.
     """
-    if starts < 1:
-        raise ValueError(f"starts: must be at least 1, found {starts}")
-    if any(isinstance(x, jax.core.Tracer) for x in jax.tree.leaves((robot, pose, q0, key))):
-        return _solve_traced(robot, jnp.asarray(pose), q0, key, starts)
-    poses = check_pose(robot, pose)
-    batch = poses.shape[:-2]
-    reference = _check_reference(robot, q0, batch)
     with jax.enable_x64(True):
-        flat = _solve_in_rounds(
+        return _solve_in_rounds(
             jax.tree.map(lambda x: np.asarray(x, np.float64), robot),
-            poses.reshape(-1, 4, 4),
-            reference.reshape(-1, reference.shape[-1]),
+            poses,
+            reference,
             jax.random.key(0) if key is None else key,
             starts,
         )
-    return jax.tree.map(lambda x: x.reshape((*batch, *x.shape[1:])), flat)
 
 
-def check_pose(robot: Robot, pose: object) -> Float[np.ndarray, "*batch 4 4"]:
-    """Host check of tool poses that the robot is asked to reach.
-
-    Returns:
-        The poses as a float64 NumPy array.
-
-    Raises:
-        ValueError: Wrong shape, not finite, not a rigid transform, or so far away that its unit
-            must be wrong; names the row of the batch.
-    """
-    checked = host_array("pose", pose, last=4)
-    if checked.shape[-2:-1] != (4,):
-        raise ValueError(f"pose: must have shape (..., 4, 4), found {checked.shape}")
-    rotation = checked[..., :3, :3]
-    skew = np.abs(np.swapaxes(rotation, -1, -2) @ rotation - np.eye(3)).max(axis=(-1, -2))
-    last_row = np.abs(checked[..., 3, :] - [0, 0, 0, 1]).max(axis=-1)
-    distance = _distance_from_root(robot, checked)
-    limit = UNIT_SUSPICION * _reach(robot)
-    for wrong, message, found in (
-        (last_row > 0, "last row must be (0, 0, 0, 1); it is off by", last_row),
-        (
-            skew > ROTATION_TOLERANCE,
-            f"not a rotation: the largest entry of R'R - 1 must be below {ROTATION_TOLERANCE:g}, "
-            "found",
-            skew,
-        ),
-        (
-            np.linalg.det(rotation) < 0,
-            "not a rotation but a reflection: the determinant must be 1, found",
-            np.linalg.det(rotation),
-        ),
-        (
-            distance > limit,
-            f"position must be within {limit:.4g} m of the arm's root ({UNIT_SUSPICION:g} times "
-            "its length; positions are in metres: are these millimetres?), found",
-            distance,
-        ),
-    ):
-        rows = np.argwhere(wrong)
-        if len(rows):
-            row = tuple(int(i) for i in rows[0])
-            raise ValueError(f"pose{list(row) if row else ''}: {message} {found[row]:.4g}")
-    return checked
-
-
-def _check_reference(
-    robot: Robot, q0: object, batch: tuple[int, ...]
-) -> Float[np.ndarray, "*batch dof"]:
-    """q0, or the straight arm, for every pose of the batch."""
-    if q0 is None:
-        return np.zeros((*batch, 2 * robot.n_segments))
-    try:
-        reference = check_configuration(robot, q0)
-    except ValueError as error:
-        raise ValueError("q0" + str(error).removeprefix("q")) from None
-    try:
-        return np.broadcast_to(reference, (*batch, reference.shape[-1]))
-    except ValueError:
-        raise ValueError(
-            f"q0: batch axes {reference.shape[:-1]} must broadcast to those of pose, {batch}"
-        ) from None
-
-
-def _solve_traced(
+def solve_traced(
     robot: Robot,
     pose: Float[jax.Array, "*batch 4 4"],
     q0: Float[Array, "*#batch dof"] | None,
@@ -308,7 +164,7 @@ def descend_from_starts(
         first: Starts in earlier rounds.
         count: Starts in this one.
     """
-    target = _orthonormalised(pose)[..., None, :, :]
+    target = orthonormalised(pose)[..., None, :, :]
     wanted = bending_from_configuration(reference)[..., None, :, :]
     begin = bending_from_configuration(begin)[..., None, :, :]
     start = _starts(robot, begin, key, first, count)
@@ -328,7 +184,7 @@ def descend_from_starts(
         jnp.asarray(q).at[..., 0::2].min(jnp.asarray(robot.theta_max))
     )  # hypot may round the limit up
     failure = jnp.where(
-        _distance_from_root(robot, pose) > _reach(robot),
+        distance_from_root(robot, pose) > reach(robot),
         IkStatus.OUT_OF_REACH,
         jnp.where(jnp.any(binding, axis=-1), IkStatus.LIMITED, IkStatus.NOT_CONVERGED),
     )
@@ -496,24 +352,6 @@ def _within_limits(robot: Robot, b: Float[Array, "*batch S 2"]) -> Float[Array, 
     """Each bending shortened to its limit."""
     theta = jnp.hypot(b[..., 0], b[..., 1])
     return b * jnp.where(theta > robot.theta_max, robot.theta_max / theta, 1.0)[..., None]
-
-
-def _orthonormalised(pose: Float[Array, "*batch 4 4"]) -> Float[Array, "*batch 4 4"]:
-    """Two Newton steps towards the nearest rotation: an error of 1e-5 becomes 1e-20."""
-    rotation = jnp.asarray(pose)[..., :3, :3]
-    for _ in range(2):
-        gram = jnp.swapaxes(rotation, -1, -2) @ rotation
-        rotation = rotation @ (1.5 * jnp.eye(3) - 0.5 * gram)
-    return jnp.asarray(pose).at[..., :3, :3].set(rotation)
-
-
-def _reach(robot: Robot) -> Any:
-    """Length of the straight arm and of its tool [m]: no position is farther from the root."""
-    return robot.length.sum() + (robot.tool[:3, 3] ** 2).sum() ** 0.5
-
-
-def _distance_from_root(robot: Robot, pose: Float[Array, "*batch 4 4"]) -> Any:
-    return ((pose[..., :3, 3] - robot.base[:3, 3]) ** 2).sum(axis=-1) ** 0.5
 
 
 def _merit_of(robot: Robot, result: IkResult) -> Any:

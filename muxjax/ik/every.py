@@ -1,0 +1,105 @@
+"""The face for all solutions."""
+
+from __future__ import annotations
+
+import jax
+import numpy as np
+from jaxtyping import Float, Int
+
+from muxjax.ik.all_solutions import Found, solutions_of_three
+from muxjax.ik.checks import check_pose
+from muxjax.ik.descent import ORIENTATION_TOLERANCE, POSITION_TOLERANCE
+from muxjax.ik.frames import disc_goals
+from muxjax.ik.result import AllIkResult
+from muxjax.robot import Robot
+
+Array = jax.Array | np.ndarray
+
+CHUNK = 1024  # poses at a time
+
+
+def all_ik(robot: Robot, pose: Float[Array, "*batch 4 4"]) -> AllIkResult:
+    """Every configuration within the bending limits that reaches each tool pose, in float64.
+
+    Three segments that bend by no more than 180 degrees are searched exhaustively (MODEL.md
+    section 8). ``complete`` is false for poses that have infinitely many solutions, such as a
+    point straight above the root: some of them are returned.
+
+    Args:
+        robot: The arm; its base and tool frames are included.
+        pose: Homogeneous transforms [m], any leading batch axes; checked as by ``solve_ik``.
+
+    Returns:
+        NumPy float64 arrays. Each solution meets the pose within 1e-10 m and 1e-10 rad; they are
+        ordered by bending, least first.
+
+    Raises:
+        ValueError: Another number of segments or wider limits; a pose that cannot be meant (the
+            message names the row); or a call inside a JAX trace: the number of solutions is known
+            only on the host.
+    """
+    if any(isinstance(x, jax.core.Tracer) for x in jax.tree.leaves((robot, pose))):
+        raise ValueError("all_ik: the number of solutions is data, so it cannot be traced")
+    if not is_exhaustive(robot):
+        raise ValueError("all_ik: needs three segments that bend by at most 180 degrees")
+    poses = check_pose(robot, pose)
+    batch, flat = poses.shape[:-2], poses.reshape(-1, 4, 4)
+    host = jax.tree.map(lambda x: np.asarray(x, np.float64), robot)
+    tolerance = (POSITION_TOLERANCE, ORIENTATION_TOLERANCE)
+    parts, complete = [], np.ones(len(flat), bool)
+    with jax.enable_x64(True):
+        for start in range(0, len(flat), CHUNK):
+            goal = disc_goals(host, flat[start : start + CHUNK])
+            found, whole = solutions_of_three(host.length, host.theta_max, goal, tolerance)
+            parts.append(found._replace(row=found.row + start))
+            complete[start : start + CHUNK] = whole
+    result = _packed(host, len(flat), parts, complete)
+    return jax.tree.map(lambda x: x.reshape((*batch, *x.shape[1:])), result)
+
+
+def is_exhaustive(robot: Robot) -> bool:
+    """Three segments within 180 degrees, for which all solutions can be found."""
+    return robot.n_segments == 3 and bool(np.all(robot.theta_max <= np.pi + 1e-12))
+
+
+def polar(robot: Robot, b: Float[np.ndarray, "n dof"]) -> Float[np.ndarray, "n dof"]:
+    """Configurations of Cartesian bending, theta within the limits and phi in [0, 2 pi)."""
+    theta = np.hypot(b[:, 0::2], b[:, 1::2])
+    phi = np.arctan2(b[:, 1::2], b[:, 0::2]) % (2 * np.pi)
+    phi[(phi >= 2 * np.pi) | (theta == 0)] = 0.0  # -1e-17 % 2 pi rounds to 2 pi itself
+    theta = np.minimum(theta, robot.theta_max)
+    return np.stack([theta, phi], axis=-1).reshape(b.shape)
+
+
+def _packed(robot: Robot, rows: int, parts: list[Found], complete: np.ndarray) -> AllIkResult:
+    """The list of solutions as one padded array."""
+    dof = 2 * robot.n_segments
+    none = Found(np.zeros(0, int), np.zeros((0, dof)), *(np.zeros(0) for _ in range(3)))
+    found = Found(*(np.concatenate(x) for x in zip(none, *parts, strict=True)))
+    order = np.lexsort((np.sum(found.b**2, axis=1), found.row))
+    row = found.row[order]
+    slot = _rank_in_row(row)
+    most = int(slot.max(initial=-1)) + 1
+
+    def spread(values: np.ndarray) -> np.ndarray:
+        wide = np.full((rows, most, *values.shape[1:]), np.nan)
+        wide[row, slot] = values[order]
+        return wide
+
+    mask = np.zeros((rows, most), bool)
+    mask[row, slot] = True
+    return AllIkResult(
+        q=spread(polar(robot, found.b)),
+        mask=mask,
+        singular_value=spread(found.singular),
+        position_error=spread(found.position),
+        orientation_error=spread(found.angle),
+        complete=complete,
+    )
+
+
+def _rank_in_row(row: Int[np.ndarray, " n"]) -> Int[np.ndarray, " n"]:
+    """Place of each entry among those of its row; the rows are sorted."""
+    first = np.concatenate([[True], row[1:] != row[:-1]])[: len(row)]
+    start = np.flatnonzero(first)
+    return np.arange(len(row)) - np.repeat(start, np.diff([*start, len(row)]))

@@ -1,0 +1,239 @@
+"""The device side of a sweep: samples in, marks in a table out.
+
+Every device holds its own table of all bins and cells, one byte each, and takes every D-th block.
+Tables of several devices, in one process or many, are merged by a maximum: marks are either set
+or not, so the order of merging, the number of devices and a repeated block change nothing.
+"""
+
+from __future__ import annotations
+
+from functools import lru_cache, partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jax.sharding import Mesh, NamedSharding, PartitionSpec
+from jaxtyping import Int32, UInt8, UInt32
+
+from muxjax.batched import WIDE_VECTORS, Chain
+from muxjax.workspace.cells import slot_index
+from muxjax.workspace.sampling import (
+    BLOCK,
+    COLUMNS,
+    ROWS,
+    Sampler,
+    bending_of,
+    lattice_fractions,
+    lattice_parts,
+    random_fractions,
+)
+
+_AXIS = "device"
+ROUNDS_PER_FLUSH = 1 << 13  # 2^13 blocks of 2^17 samples: an int32 count cannot reach 2^31
+
+
+class Tables(NamedTuple):
+    """Marks and counts of each device."""
+
+    marks: UInt8[jax.Array, "D B*C"]  # bin * cells + cell: 1 if some sample fell there
+    counts: Int32[jax.Array, "D C"]  # samples in each cell since the last flush
+
+
+class Layout(NamedTuple):
+    """What a compiled sweep depends on."""
+
+    shape: tuple[int, int, int]  # (sectors, radii, heights)
+    per_axis: int  # orientation bins
+    n_bins: int
+    sampler: Sampler
+
+    @property
+    def n_cells(self) -> int:
+        """Cells in all."""
+        return int(np.prod(self.shape))
+
+    @property
+    def in_plane(self) -> bool:
+        """The arm is axially symmetric: phi_1 is not sampled, poses are turned into one plane."""
+        return self.shape[0] == 1
+
+
+class Scale(NamedTuple):
+    """The robot of a sweep; none of it is compiled in, so that designs share a compilation."""
+
+    arm: Chain
+    theta_max: jax.Array
+    reach: jax.Array
+
+
+@lru_cache(maxsize=1)
+def all_devices() -> Mesh:
+    """The devices of all processes, as one axis."""
+    return Mesh(np.array(jax.devices()), (_AXIS,))
+
+
+def new_tables(layout: Layout, marks: np.ndarray | None = None) -> Tables:
+    """Empty tables; or with the given marks, of size (bins * cells,), on the first device."""
+    mesh = all_devices()
+    sharding = NamedSharding(mesh, PartitionSpec(_AXIS))
+    size = layout.n_bins * layout.n_cells
+
+    if marks is None:
+        empty = jnp.zeros((mesh.size, size), jnp.uint8, device=sharding)
+        return Tables(empty, _zero_counts(layout))
+
+    def rows(index: Any) -> np.ndarray:
+        first = index[0].start in (0, None)
+        return marks[None] if first else np.zeros((1, size), np.uint8)
+
+    filled = jax.make_array_from_callback((mesh.size, size), sharding, rows)
+    return Tables(filled, _zero_counts(layout))
+
+
+def _zero_counts(layout: Layout) -> jax.Array:
+    mesh = all_devices()
+    return jax.make_array_from_callback(
+        (mesh.size, layout.n_cells),
+        NamedSharding(mesh, PartitionSpec(_AXIS)),
+        lambda index: np.zeros((1, layout.n_cells), np.int32),
+    )
+
+
+def visit_round(
+    layout: Layout, tables: Tables, scale: Scale, seed: int, first: int, samples: int
+) -> Tables:
+    """Every device marks one block: blocks ``first`` ... ``first`` + D - 1, up to ``samples``."""
+    mesh = all_devices()
+    whole, rest = divmod(samples, BLOCK)
+    limits = np.array([first, whole, rest], np.uint32)
+    dimensions = 2 * len(scale.arm.n_discs) - layout.in_plane
+    if layout.sampler == "random":
+        draws: tuple[Any, ...] = (np.array([seed, seed >> 32], np.uint64).astype(np.uint32),)
+    else:
+        # Beyond the end a device repeats block 0, which changes nothing.
+        blocks = [b if b * BLOCK < samples else 0 for b in range(first, first + mesh.size)]
+        parts = [lattice_parts(dimensions, seed, block) for block in blocks]
+        rows = np.stack([rows for rows, _ in parts])
+        # Each device is handed its own: picking it on the device would undo the vector code.
+        sharding = NamedSharding(mesh, PartitionSpec(_AXIS))
+        own = jax.make_array_from_callback(rows.shape, sharding, lambda index: rows[index])
+        draws = (own, parts[0][1])
+    slots, mark = _compiled_round(layout, dimensions, mesh)
+    return mark(tables, slots(scale, limits, draws), limits)
+
+
+@lru_cache(maxsize=16)
+def _compiled_round(layout: Layout, dimensions: int, mesh: Mesh) -> tuple[Any, Any]:
+    """Samples to slots, and slots to marks.
+
+    They are two programs because XLA would otherwise compute the samples again inside the
+    scatters, one by one, at ten times the cost.
+    """
+    split, same = PartitionSpec(_AXIS), PartitionSpec()
+    slots = jax.shard_map(
+        partial(_block_slots, layout, dimensions),
+        mesh=mesh,
+        in_specs=(same, same, (same,) if layout.sampler == "random" else (split, same)),
+        out_specs=split,
+    )
+    mark = jax.shard_map(
+        partial(_mark, layout), mesh=mesh, in_specs=(split, split, same), out_specs=split
+    )
+    return (
+        jax.jit(slots, compiler_options=WIDE_VECTORS),
+        jax.jit(mark, donate_argnums=0),
+    )
+
+
+def _assignment(limits: UInt32[jax.Array, " 3"]) -> tuple[jax.Array, jax.Array]:
+    """This device's block in a round and how many of its samples are wanted.
+
+    A device without work repeats block 0 with no sample counted, which changes nothing: marking
+    twice is marking once, and block 0 is part of every sweep.
+    """
+    wanted = limits[0] + lax.axis_index(_AXIS).astype(jnp.uint32)
+    whole, rest = limits[1], limits[2]
+    valid = jnp.where(wanted < whole, np.uint32(BLOCK), jnp.where(wanted == whole, rest, 0))
+    return jnp.where(valid > 0, wanted, 0), valid
+
+
+def _block_slots(
+    layout: Layout,
+    dimensions: int,
+    scale: Scale,
+    limits: UInt32[jax.Array, " 3"],
+    draws: tuple[jax.Array, ...],
+) -> Int32[jax.Array, "1 R C"]:
+    """Slots of one device's block, all its lanes."""
+    block, _ = _assignment(limits)
+    lane = lax.broadcasted_iota(jnp.uint32, (ROWS, COLUMNS), 0) * np.uint32(COLUMNS)
+    lane = lane + lax.broadcasted_iota(jnp.uint32, (ROWS, COLUMNS), 1)
+    if layout.sampler == "random":
+        fractions = random_fractions(draws[0], block, lane, dimensions)
+    else:
+        fractions = lattice_fractions(draws[0][0], draws[1])
+    u = bending_of(scale.arm, scale.theta_max, fractions, layout.in_plane)
+    slots = slot_index(scale.arm, u, scale.reach, layout.shape, layout.per_axis)
+    # Not flattened here: a one-dimensional loop over outer sums is not vectorised.
+    return slots[None]
+
+
+def _mark(
+    layout: Layout,
+    tables: Tables,
+    slots: Int32[jax.Array, "1 R C"],
+    limits: UInt32[jax.Array, " 3"],
+) -> Tables:
+    """Set the marks of one device's block and count its wanted samples.
+
+    Lanes beyond the last sample repeat lane 0, uncounted.
+    """
+    _, valid = _assignment(limits)
+    wanted = lax.iota(jnp.uint32, BLOCK) < valid
+    slot = jnp.where(wanted, slots.reshape(BLOCK), slots[0, 0, 0])
+    return Tables(
+        tables.marks.at[0, slot].set(np.uint8(1), mode="promise_in_bounds"),
+        tables.counts.at[0, slot % layout.n_cells].add(
+            wanted.astype(jnp.int32), mode="promise_in_bounds"
+        ),
+    )
+
+
+def merged_marks(layout: Layout, tables: Tables) -> np.ndarray:
+    """Marks of all devices together, bits of cells, shape (bins, ceil(cells / 8))."""
+    merged = tables.marks if all_devices().size == 1 else _largest()(tables.marks)
+    marks = np.asarray(merged.addressable_data(0)).reshape(layout.n_bins, layout.n_cells)
+    return np.packbits(marks, axis=1)
+
+
+def flush_counts(layout: Layout, tables: Tables) -> tuple[Tables, np.ndarray]:
+    """Counts of all devices since the last flush as int64, and tables that count from zero."""
+    total = _summed()(tables.counts) if all_devices().size > 1 else tables.counts
+    # Many devices' sums would leave int32, so they are gathered, not added, on the device.
+    counts = np.asarray(total.addressable_data(0), np.int64).reshape(-1, layout.n_cells)
+    return Tables(tables.marks, _zero_counts(layout)), counts.sum(axis=0)
+
+
+@lru_cache(maxsize=1)
+def _largest() -> Any:
+    return jax.jit(
+        jax.shard_map(
+            lambda marks: lax.pmax(marks, _AXIS),
+            mesh=all_devices(),
+            in_specs=PartitionSpec(_AXIS),
+            out_specs=PartitionSpec(),
+        )
+    )
+
+
+@lru_cache(maxsize=1)
+def _summed() -> Any:
+    mesh = all_devices()
+    return jax.jit(lambda counts: counts, out_shardings=NamedSharding(mesh, PartitionSpec()))
+
+
+def unpacked_marks(layout: Layout, packed: np.ndarray) -> np.ndarray:
+    """Inverse of ``merged_marks``'s packing, shape (bins * cells,)."""
+    return np.unpackbits(packed, axis=1, count=layout.n_cells).reshape(-1)

@@ -55,6 +55,26 @@ def test_ik_answers_with_its_exit_code(muxjax):
     assert json.loads(out)["status"] == "out_of_reach"
 
 
+def test_ik_lists_all_solutions_and_minds_a_world(muxjax):
+    pose = ("ik", "--xyz-mm", "152.25", "0", "413.777", "--rpy-deg", "0", "25", "0")
+    code, out, _ = muxjax(*pose, "--all", "--json")
+    document = json.loads(out)
+    assert code == 0
+    assert document["complete"] is True
+    given = np.radians([60, 0, 75, 180, 40, 0])
+    assert any(np.allclose(q, given, atol=1e-4) for q in document["q"])
+    assert len(document["q"]) > 1
+    code, out, _ = muxjax(*pose, "--all")
+    assert code == 0
+    assert f"{len(document['q'])} solutions" in out
+    code, out, _ = muxjax(*pose, "--world", "cabinet", "--json")
+    document = json.loads(out)
+    assert (code == 0) == (document["clearance_m"] > 0)
+    code, _, err = muxjax(*pose, "--world", "moon")
+    assert code == 2
+    assert "no 'moon' among" in err
+
+
 def test_plan_then_run(muxjax, tmp_path):
     path = str(tmp_path / "program.json")
     code, out, _ = muxjax(

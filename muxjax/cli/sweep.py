@@ -123,9 +123,18 @@ def _report_study(study: DesignStudy, out: Path, json: bool) -> int:
     if json:
         print_json(rows)
     else:
-        table = Table(*rows[0])
+        headings = ("reach [mm]", "volume [dm3]", "dexterity", "limit", "peak", "stroke [mm]")
+        table = Table(*study.parameters, *headings)
         for row in rows:
-            table.add_row(*(f"{value:.4g}" for value in row.values()))
+            table.add_row(
+                *(f"{row[name]:g}" for name in study.parameters),
+                f"{1e3 * row['reach_radius_m']:.1f}",
+                f"{1e3 * row['reach_volume_m3']:.1f}",
+                f"{row['mean_dexterity']:.4f}",
+                f"{row['mean_dexterity_limit']:.3f} +- {row['limit_uncertainty']:.3f}",
+                f"{row['peak_dexterity']:.4f}",
+                f"{1e3 * row['tendon_stroke_m']:.1f}",
+            )
         console.print(table)
     plots = _plots()
     if plots is not None:

@@ -46,7 +46,7 @@ def program(
             end[robot.axial_map[item.axial - 1, servo - 1]] += move
     return Program(
         robot=robot.config.name,
-        fingerprint=robot.config.fingerprint,
+        fingerprint=robot.fingerprint,
         start=tuple(start.tolist()),
         target=tuple(end.tolist()),
         axial=None,

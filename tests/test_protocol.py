@@ -178,8 +178,8 @@ def test_status_choices_fit_the_enum():
 
 
 def test_fingerprint_words_are_the_fingerprint(robot):
-    words = fingerprint_words(robot.config.fingerprint)
-    assert "".join(f"{word:04x}" for word in words) == robot.config.fingerprint
+    words = fingerprint_words(robot.fingerprint)
+    assert "".join(f"{word:04x}" for word in words) == robot.fingerprint
 
 
 def bigger(robot: Robot, **changes: object) -> Robot:

@@ -80,7 +80,7 @@ class Bench:
 
     def arm(self) -> Bench:
         self.do(Op.HELLO, arg=VERSION << 16 | SESSION)
-        for k, word in enumerate(fingerprint_words(self.robot.config.fingerprint), start=1):
+        for k, word in enumerate(fingerprint_words(self.robot.fingerprint), start=1):
             self.do(Op.ROBOT, k, word)
         self.beat()
         self.do(Op.ARM, arg=SESSION)
@@ -132,7 +132,7 @@ def test_unarmed_board_refuses_to_move(muxarm, op, greeted):
 
 
 def test_arming_needs_session_robot_and_heartbeat(bench):
-    words = fingerprint_words(bench.robot.config.fingerprint)
+    words = fingerprint_words(bench.robot.fingerprint)
     assert bench.command(Op.HELLO, arg=99 << 16 | SESSION) == (
         Status.REJECTED,
         Reason.WRONG_VERSION,
@@ -153,7 +153,7 @@ def test_arming_needs_session_robot_and_heartbeat(bench):
 
 def test_handshake_out_of_order_is_refused(bench):
     bench.seq = 0
-    word = fingerprint_words(bench.robot.config.fingerprint)[0]
+    word = fingerprint_words(bench.robot.fingerprint)[0]
     assert bench.command(Op.ROBOT, 1, word) == (Status.REJECTED, Reason.WRONG_SESSION)
     assert bench.command(Op.ARM, arg=0) == (Status.REJECTED, Reason.WRONG_SESSION)
     bench.engage()

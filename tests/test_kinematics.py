@@ -258,7 +258,7 @@ def test_bad_configurations_are_refused(muxarm, call):
 
 
 def test_backbone_refuses_no_intervals(muxarm):
-    with pytest.raises(ValueError, match=r"n: must be a whole number of intervals, at least 1, found 0"):
+    with pytest.raises(ValueError, match="n: must be a whole number of intervals"):
         muxjax.backbone(muxarm, np.zeros(6), 0)
 
 

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import math
 from functools import lru_cache
-from typing import Literal
+from typing import Any, Literal
 
 import equinox as eqx
 import jax
@@ -189,7 +189,7 @@ def pose_values(arm: Chain, u: Vector, output: Output, *, in_base: bool = False)
             for r in range(3)
         )
         if turn is not None:
-            turn = _product(tuple(arm.base_turn), turn)
+            turn = product(tuple(arm.base_turn), turn)
     if turn is None:
         return place
     return place + (turn if output == "quaternion" else _matrix(turn))
@@ -224,7 +224,8 @@ def _bend(q: Vector | None, ex: jax.Array, ey: jax.Array, c: jax.Array) -> Vecto
     )
 
 
-def _product(p: Vector, q: Vector) -> Vector:
+def product(p: tuple[Any, ...], q: tuple[Any, ...]) -> tuple[Any, ...]:
+    """Quaternion product, (w, x, y, z)."""
     (a, b, c, d), (w, x, y, z) = p, q
     return (
         a * w - b * x - c * y - d * z,

@@ -18,7 +18,8 @@ from jaxtyping import Bool, Float, Int
 from scipy.stats import qmc
 
 from muxjax.batched import WIDE_VECTORS
-from muxjax.ik.arcs import Array, Numbers, conjugate, product
+from muxjax.batched.formulas import product
+from muxjax.ik.arcs import Array, Numbers, conjugate
 from muxjax.ik.newton import in_pieces, judge, newton, padded, solved
 from muxjax.ik.planar import planar_seeds
 from muxjax.ik.reduction import INTERVALS, Target, chord, equation, point, sweep

@@ -18,6 +18,8 @@ import numpy as np
 from jax import lax
 from jaxtyping import Float
 
+from muxjax.batched.formulas import product
+
 Array = jax.Array | np.ndarray
 Numbers = tuple[Array, ...]  # arrays of one shape, each one component of a vector or quaternion
 
@@ -75,17 +77,6 @@ def dot(a: Numbers, b: Numbers) -> Array:
     for x, y in zip(a[1:], b[1:], strict=True):
         total = total + x * y
     return total
-
-
-def product(p: Numbers, q: Numbers) -> Numbers:
-    """Quaternion product, (w, x, y, z)."""
-    (a, b, c, d), (w, x, y, z) = p, q
-    return (
-        a * w - b * x - c * y - d * z,
-        a * x + b * w + c * z - d * y,
-        a * y - b * z + c * w + d * x,
-        a * z + b * y - c * x + d * w,
-    )
 
 
 def conjugate(q: Numbers) -> Numbers:

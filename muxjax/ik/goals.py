@@ -14,7 +14,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from muxjax.ik.arcs import Array, Numbers, Tip, conjugate, dot, product, turn_by
+from muxjax.batched.formulas import product
+from muxjax.ik.arcs import Array, Numbers, Tip, conjugate, dot, turn_by
 from muxjax.ik.frames import inverse, quaternion, without_rounding
 from muxjax.precision import host_array
 from muxjax.robot import Robot

@@ -27,7 +27,8 @@ from jaxtyping import Float
 from numpy.polynomial import Chebyshev, Polynomial
 
 from muxjax.batched import WIDE_VECTORS
-from muxjax.ik.arcs import Array, Numbers, conjugate, cross, dot, product, series
+from muxjax.batched.formulas import product
+from muxjax.ik.arcs import Array, Numbers, conjugate, cross, dot, series
 
 INTERVALS = 64  # of the admissible arc of q3
 # A bracket of a solution at a bending limit reaches over it: w may pass its limit by this much

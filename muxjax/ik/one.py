@@ -12,29 +12,19 @@ import numpy as np
 from jaxtyping import Float, PRNGKeyArray
 
 from muxjax.collision import CAPSULES, World, part_clearances
-from muxjax.ik.all_solutions import AT_LIMIT
-from muxjax.ik.checks import check_pose, check_reference, distance_from_root, reach
-from muxjax.ik.descent import (
-    ORIENTATION_TOLERANCE,
-    POSITION_TOLERANCE,
-    STARTS,
-    solve_by_descent,
-    solve_traced,
-)
-from muxjax.ik.every import all_ik, is_exhaustive, polar
-from muxjax.ik.goals import check_weights, tool_goals
+from muxjax.ik.checks import check_pose, check_reference
+from muxjax.ik.descent import STARTS, solve_by_descent, solve_traced
+from muxjax.ik.every import all_ik, is_exhaustive
+from muxjax.ik.goals import check_weights
 from muxjax.ik.implicit import attach_derivatives
-from muxjax.ik.levenberg import MOST_SEGMENTS, Reached, levenberg, nearest_entries
+from muxjax.ik.levenberg import MOST_SEGMENTS
 from muxjax.ik.result import AllIkResult, IkResult, IkStatus
+from muxjax.ik.seeded import bending_of, closest, from_table
 from muxjax.precision import pad_rows
 from muxjax.robot import Robot
 
 Array = jax.Array | np.ndarray
 Method = Literal["auto", "all", "levenberg_marquardt", "pseudo_inverse"]
-
-FIRST_STARTS = 8  # of Levenberg-Marquardt: the reference and the nearest entries of the table
-MORE_STARTS = 64  # where these failed
-FEW_STEPS, MORE_STEPS = 24, 60
 
 
 def solve_ik(
@@ -118,7 +108,7 @@ def solve_ik(
         case "pseudo_inverse":
             flat = solve_by_descent(host, poses, reference, key, starts)
         case _:
-            flat = _from_table(host, poses, reference, wanted)
+            flat = from_table(host, poses, reference, wanted)
     return jax.tree.map(lambda x: x.reshape((*batch, *x.shape[1:])), flat)
 
 
@@ -142,11 +132,6 @@ def _fitting(robot: Robot, method: Method, weights: Float[np.ndarray, " 6"]) -> 
     return method
 
 
-def _bending(q: Float[np.ndarray, "*n dof"]) -> Float[np.ndarray, "*n dof"]:
-    theta, phi = q[..., 0::2], q[..., 1::2]
-    return np.stack([theta * np.cos(phi), theta * np.sin(phi)], axis=-1).reshape(q.shape)
-
-
 def _from_all(
     robot: Robot,
     poses: Float[np.ndarray, "rows 4 4"],
@@ -158,7 +143,7 @@ def _from_all(
     """The nearest of all solutions; descents where there is none, or a continuum of them."""
     every = jax.tree.map(np.asarray, all_ik(robot, poses))
     solved = every.mask.any(axis=-1)
-    away = np.sum((_bending(every.q) - _bending(reference)[:, None]) ** 2, axis=-1)
+    away = np.sum((bending_of(every.q) - bending_of(reference)[:, None]) ** 2, axis=-1)
     parts = None if world is None else _parts(robot, every, world)
     if parts is not None:
         depth = np.minimum(parts.min(axis=-1), 0.0)
@@ -175,7 +160,7 @@ def _from_all(
 
     q, position, angle = map(taken, (every.q, every.position_error, every.orientation_error))
     q = np.where(solved[:, None], q, 0.0)
-    result = _result(robot, poses, q, position, angle, solved)
+    result = closest(robot, poses, q, position, angle, solved)
     if parts is not None:
         found = np.where(solved[:, None], taken(parts), np.nan)
         return _with_clearance(result, found, solved)
@@ -185,7 +170,7 @@ def _from_all(
     other = jax.tree.map(
         np.asarray, solve_by_descent(robot, poses[open_rows], reference[open_rows], key, starts)
     )
-    distance = np.sum((_bending(other.q) - _bending(reference[open_rows])) ** 2, axis=-1)
+    distance = np.sum((bending_of(other.q) - bending_of(reference[open_rows])) ** 2, axis=-1)
     better = ~solved[open_rows] | (other.converged & (distance < nearest[open_rows]))
     for kept, new in zip(jax.tree.leaves(result), jax.tree.leaves(other), strict=True):
         kept[open_rows[better]] = new[better]
@@ -227,55 +212,3 @@ def _with_clearance(
         ),
         is_leaf=lambda x: x is None,
     )
-
-
-def _from_table(
-    robot: Robot,
-    poses: Float[np.ndarray, "rows 4 4"],
-    reference: Float[np.ndarray, "rows dof"],
-    weights: Float[np.ndarray, " 6"],
-) -> IkResult:
-    """Levenberg-Marquardt from the reference and from the table's nearest entries."""
-    rows, dof = reference.shape
-    wanted = _bending(reference)
-    best = Reached(np.zeros((dof, rows)), *(np.full(rows, np.inf) for _ in range(3)))
-    with jax.enable_x64(True):
-        goal = tool_goals(robot, poses)
-        for count, steps in ((FIRST_STARTS, FEW_STEPS), (MORE_STARTS, MORE_STEPS)):
-            open_rows = np.flatnonzero(~_reached(best))
-            if not len(open_rows):
-                break
-            start = nearest_entries(robot, goal[:, open_rows], weights, count)
-            start[:, :, 0] = wanted[open_rows].T
-            many = np.repeat(open_rows, count)
-            found = levenberg(
-                robot, start.reshape(dof, -1), wanted[many].T, goal[:, many], weights, steps
-            )
-            away = np.sum((found.b - wanted[many].T) ** 2, axis=0)
-            rank = np.where(_reached(found), away / (1 + away), 1 + found.merit / (1 + found.merit))
-            pick = np.argmin(rank.reshape(-1, count), axis=1) + count * np.arange(len(open_rows))
-            for kept, new in zip(best, found, strict=True):
-                kept[..., open_rows] = new[..., pick]
-    return _result(robot, poses, polar(robot, best.b.T), best.position, best.angle, _reached(best))
-
-
-def _reached(found: Reached) -> np.ndarray:
-    return (found.position < POSITION_TOLERANCE) & (found.angle < ORIENTATION_TOLERANCE)
-
-
-def _result(
-    robot: Robot,
-    poses: Float[np.ndarray, "rows 4 4"],
-    q: Float[np.ndarray, "rows dof"],
-    position: Float[np.ndarray, " rows"],
-    angle: Float[np.ndarray, " rows"],
-    solved: np.ndarray,
-) -> IkResult:
-    binding = q[:, 0::2] >= robot.theta_max - AT_LIMIT
-    failure = np.where(
-        distance_from_root(robot, poses) > reach(robot),
-        int(IkStatus.OUT_OF_REACH),
-        np.where(binding.any(axis=-1), int(IkStatus.LIMITED), int(IkStatus.NOT_CONVERGED)),
-    )
-    status = np.where(solved, int(IkStatus.CONVERGED), failure)
-    return IkResult(q, position, angle, solved, status, binding)

@@ -143,6 +143,9 @@ class TargetConfig(Strict):
     near_q_deg: tuple[float, ...] | None = Field(
         default=None, description="of several configurations that reach the pose, one near this"
     )
+    base: FrameConfig | None = Field(
+        default=None, description="where the arm's root stands; the robot's own base if left out"
+    )
 
     @model_validator(mode="after")
     def _one_orientation(self) -> Self:
@@ -160,6 +163,9 @@ class TaskConfig(Strict):
 
     file_schema: Literal["muxjax/task/1"] = Field(alias="schema")
     name: str
+    world: str | None = Field(
+        default=None, description="obstacles: a shipped world, or a file beside the task's own"
+    )
     targets: Annotated[tuple[TargetConfig, ...], Field(min_length=1)]
 
     @field_validator("targets")
@@ -216,6 +222,17 @@ class ServoConfig(Strict):
     stall_torque_nm: Sourced[Positive]
 
 
+class DriveStrengthConfig(Strict):
+    """What the drive withstands. Lengths, times and programs do not depend on it."""
+
+    worm_efficiency: Sourced[Annotated[float, Field(gt=0, le=1)]] = Field(
+        description="worm and gear train together, servo driving"
+    )
+    clutch_torque_nm: Sourced[Positive] = Field(
+        description="torque at the clutch, on the servo's shaft, above which its plug slips"
+    )
+
+
 class AxialConfig(Strict):
     """The axial motor and the map c = F(a, s) of M Eq. 10."""
 
@@ -259,6 +276,7 @@ class RobotConfig(Strict):
     axial: AxialConfig
     clutch: ClutchConfig
     encoder: EncoderConfig
+    drive_strength: DriveStrengthConfig | None = None
 
     @field_validator("segments")
     @classmethod
@@ -353,8 +371,11 @@ class RobotConfig(Strict):
 
     @cached_property
     def fingerprint(self) -> str:
-        """Hash over every value (not the reasons), by which programs name their robot."""
-        values = _values_only(self.model_dump(mode="json"))
+        """Hash over every value (not the reasons), by which programs name their robot.
+
+        The strength of the drive is left out: the same program runs on a stronger one.
+        """
+        values = _values_only(self.model_dump(mode="json", exclude={"drive_strength"}))
         text = json.dumps(values, sort_keys=True, separators=(",", ":"))
         return hashlib.sha256(text.encode()).hexdigest()[:16]
 

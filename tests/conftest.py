@@ -12,7 +12,18 @@ os.environ.setdefault(
 from jaxtyping import install_import_hook
 
 # The rooms with annotated array shapes; pydantic checks config.py itself.
-SHAPED = ["robot", "kinematics", "tendons", "ik", "planning", "scheduler", "metrics", "pipeline"]
+SHAPED = [
+    "robot",
+    "kinematics",
+    "tendons",
+    "collision",
+    "ik",
+    "planning",
+    "scheduler",
+    "metrics",
+    "pipeline",
+    "statics",
+]
 install_import_hook([f"muxjax.{room}" for room in SHAPED], "beartype.beartype")
 
 import numpy as np

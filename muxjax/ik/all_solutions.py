@@ -7,6 +7,7 @@ roots for q1 meet. Planar targets make the reduction singular and have their own
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import partial
 from typing import NamedTuple
 
@@ -20,7 +21,7 @@ from scipy.stats import qmc
 from muxjax.batched import WIDE_VECTORS
 from muxjax.batched.formulas import product
 from muxjax.ik.arcs import Array, Numbers, conjugate
-from muxjax.ik.newton import in_pieces, judge, newton, padded, solved
+from muxjax.ik.newton import Solved, in_pieces, newton, padded, smallest_singular, solved
 from muxjax.ik.planar import planar_seeds
 from muxjax.ik.reduction import INTERVALS, Target, chord, equation, point, sweep
 
@@ -122,12 +123,11 @@ def _searched(
     theta, phi = theta_max * np.sqrt(unit[:, :3]), 2 * np.pi * unit[:, 3:]
     starts = np.stack([theta * np.cos(phi), theta * np.sin(phi)], axis=-1).reshape(STARTS, 6)
     row, b = np.repeat(rows, STARTS), np.tile(starts.T, len(rows))
-    b = newton(
+    at = newton(
         length, b, goal[:, row], steps=SEARCH_STEPS, damping=SEARCH_DAMPING, theta_max=theta_max
     )
-    at = judge(length, b, goal[:, row])
     near = solved(at, NEAR * length.sum(), NEAR)
-    return row[near], b[:, near]
+    return row[near], at.b[:, near]
 
 
 def _planar(
@@ -329,42 +329,50 @@ def _polished(
     """The distinct solutions among polished candidates."""
     order = np.argsort(row, kind="stable")
     row, b = row[order], b[:, order]
-    near = newton(length, b, goal[:, row], steps=POLISH_STEPS, damping=POLISH_DAMPING)
-    at = judge(length, near, goal[:, row])
+    at = newton(length, b, goal[:, row], steps=POLISH_STEPS, damping=POLISH_DAMPING)
     late = np.flatnonzero(~solved(at, *tolerance))
     if len(late):
         again = newton(
-            length, near[:, late], goal[:, row[late]], steps=LATE_STEPS, damping=POLISH_DAMPING
+            length, at.b[:, late], goal[:, row[late]], steps=LATE_STEPS, damping=POLISH_DAMPING
         )
-        for kept, new in zip(at, judge(length, again, goal[:, row[late]]), strict=True):
+        for kept, new in zip(at, again, strict=True):
             kept[..., late] = new
     theta = np.hypot(at.b[0::2], at.b[1::2])
     inside = (theta <= theta_max[:, None] + AT_LIMIT).all(axis=0)
     good = np.flatnonzero(solved(at, *tolerance) & inside)
-    found = Found(row[good], at.b[:, good].T, at.singular[good], at.position[good], at.angle[good])
-    return _distinct(length, goal, found, tolerance)
+    row, at = row[good], Solved(*(x[..., good] for x in at))
+
+    def is_solution(row: np.ndarray, b: np.ndarray) -> np.ndarray:
+        return solved(newton(length, b, goal[:, row], steps=0), *tolerance)
+
+    kept = ~repeated(row, at.b, is_solution)
+    b = at.b[:, kept]
+    return Found(row[kept], b.T, smallest_singular(length, b), at.position[kept], at.angle[kept])
 
 
-def _distinct(
-    length: Float[np.ndarray, " 3"],
-    goal: Float[np.ndarray, "7 rows"],
-    found: Found,
-    tolerance: tuple[float, float],
-) -> Found:
-    """Each solution once; the list is ordered by target."""
-    repeated = np.zeros(len(found.row), bool)
-    for gap in range(1, len(found.row)):
-        same_row = found.row[gap:] == found.row[:-gap]
+def repeated(
+    row: Int[np.ndarray, " n"],
+    b: Float[np.ndarray, "dof n"],
+    is_solution: Callable[[np.ndarray, np.ndarray], np.ndarray],
+) -> Bool[np.ndarray, " n"]:
+    """Which solutions an earlier one of the same target equals; the list is ordered by target.
+
+    Args:
+        row: Target of each.
+        b: Cartesian bending [rad].
+        is_solution: Whether bendings solve targets, given the targets and the bendings.
+    """
+    again = np.zeros(len(row), bool)
+    for gap in range(1, len(row)):
+        same_row = row[gap:] == row[:-gap]
         if not same_row.any():
             break
         later = np.flatnonzero(same_row) + gap
-        away = np.abs(found.b[later] - found.b[later - gap]).max(axis=1)
+        away = np.abs(b[:, later] - b[:, later - gap]).max(axis=0)
         close = away < SAME
         unsure = np.flatnonzero(~close & (away < NEARLY_SAME))
         if len(unsure):
             pair = later[unsure]
-            middle = 0.5 * (found.b[pair] + found.b[pair - gap])
-            at = judge(length, np.ascontiguousarray(middle.T), goal[:, found.row[pair]])
-            close[unsure] = solved(at, *tolerance)
-        repeated[later[close]] = True
-    return Found(*(x[~repeated] for x in found))
+            close[unsure] = is_solution(row[pair], 0.5 * (b[:, pair] + b[:, pair - gap]))
+        again[later[close]] = True
+    return again

@@ -15,10 +15,6 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import lax
-from jaxtyping import Float
-
-from muxjax.batched.formulas import product
 
 Array = jax.Array | np.ndarray
 Numbers = tuple[Array, ...]  # arrays of one shape, each one component of a vector or quaternion
@@ -52,6 +48,11 @@ def bend(bx: Array, by: Array) -> Bend:
     x = 0.25 * (bx * bx + by * by)
     s = series(_SINC, x)
     return Bend(series(_COSINE, x), 0.5 * s * bx, 0.5 * s * by, s)
+
+
+def sinc_slope(bx: Array, by: Array) -> Array:
+    """D sinc(sqrt x) / dx at x = theta^2 / 4."""
+    return series(_SINC_SLOPE, 0.25 * (bx * bx + by * by))
 
 
 def turn(e: Bend, v: Numbers) -> Numbers:
@@ -93,53 +94,7 @@ def turn_by(q: Numbers, v: Numbers) -> Numbers:
     return tuple(x + q[0] * a + b for x, a, b in zip(v, t, more, strict=True))
 
 
-class Tip(NamedTuple):
-    """Position and orientation of the last frame, and the twist that each bending gives it."""
-
-    position: Numbers  # [m], in the root frame
-    quaternion: Numbers  # (w, x, y, z)
-    linear: list[Numbers]  # 2S velocities d position / d b [m/rad], in the root frame
-    angular: list[Numbers]  # 2S angular velocities, in the root frame
-
-
-def tip_and_twists(length: Float[Array, " S"], b: Numbers, tool: Numbers | None = None) -> Tip:
-    """Tip of a chain of segments with its derivatives.
-
-    Args:
-        length: Segment lengths [m].
-        b: (b_1x, b_1y, b_2x, ...) [rad], arrays of one shape.
-        tool: Tool point in the last disc's frame [m]; the disc's centre if not given.
-
-    Segment by segment from the tip: v is the tip in the distal frame, p + R v in the proximal
-    one. A segment's twist is (dp + omega x R v, omega) in its proximal frame; the bends below
-    then turn it to the root.
-    """
-    zero = jnp.zeros_like(b[0])
-    v: Numbers = (zero, zero, zero) if tool is None else tuple(zero + t for t in tool)
-    q: Numbers = (zero + 1, zero, zero, zero)
-    linear: list[Numbers] = []
-    angular: list[Numbers] = []
-    for i in reversed(range(len(b) // 2)):
-        bx, by = b[2 * i : 2 * i + 2]
-        e = bend(bx, by)
-        slope = series(_SINC_SLOPE, 0.25 * (bx * bx + by * by))
-        chord = length[i] * e.s
-        beyond = turn(e, v)
-        linear = [turn(e, column) for column in linear]
-        angular = [turn(e, column) for column in angular]
-        speeds, turns = _segment_twist(length[i], bx, by, e, slope)
-        reach = [cross(w, beyond) for w in turns]
-        linear = [
-            tuple(a + c for a, c in zip(*pair, strict=True))
-            for pair in zip(speeds, reach, strict=True)
-        ] + linear
-        angular = turns + angular
-        v = (beyond[0] + chord * e.ex, beyond[1] + chord * e.ey, beyond[2] + chord * e.c)
-        q = product((e.c, -e.ey, e.ex, zero), q)
-    return Tip(v, q, linear, angular)
-
-
-def _segment_twist(
+def segment_twist(
     length: Array, bx: Array, by: Array, e: Bend, slope: Array
 ) -> tuple[list[Numbers], list[Numbers]]:
     """Velocities and angular velocities of a segment's end by b_x and b_y, proximal frame.
@@ -166,25 +121,3 @@ def _segment_twist(
             (2 * (dc * e.ey - c * dey), 2 * (c * dex - dc * e.ex), 2 * (e.ex * dey - e.ey * dex))
         )
     return speeds, turns
-
-
-def solve_symmetric(a: list[list[Array]], y: list[Array]) -> list[Array]:
-    """X with A x = y for a positive matrix, by L D L' written out; only the lower half is read."""
-    n = len(y)
-    lower = [[a[i][j] for j in range(i + 1)] for i in range(n)]
-    inverse: list[Array] = []
-    x = list(y)
-    for j in range(n):
-        pivot = lax.optimization_barrier(1.0 / jnp.maximum(lower[j][j], 1e-300))
-        inverse.append(pivot)
-        for i in range(j + 1, n):
-            ratio = lower[i][j] * pivot
-            for k in range(j + 1, i + 1):
-                lower[i][k] = lower[i][k] - ratio * lower[k][j]
-            x[i] = x[i] - ratio * x[j]
-    for i in reversed(range(n)):
-        known = x[i]
-        for k in range(i + 1, n):
-            known = known - lower[k][i] * x[k]
-        x[i] = known * inverse[i]
-    return x

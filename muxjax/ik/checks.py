@@ -19,8 +19,16 @@ ROTATION_TOLERANCE = 1e-5  # largest entry of R'R - 1 taken for rounding and ort
 UNIT_SUSPICION = 10.0  # a pose farther away than this many arm lengths is taken for millimetres
 
 
-def check_pose(robot: Robot, pose: object) -> Float[np.ndarray, "*batch 4 4"]:
+def check_pose(
+    robot: Robot, pose: object, project: bool = False
+) -> Float[np.ndarray, "*batch 4 4"]:
     """Host check of tool poses that the robot is asked to reach.
+
+    Args:
+        robot: The arm.
+        pose: Homogeneous transforms [m].
+        project: Take the nearest rotation in place of a 3 x 3 part that is none, as for
+            measured or averaged poses. Reflections are refused all the same.
 
     Returns:
         The poses as a float64 NumPy array.
@@ -33,6 +41,10 @@ def check_pose(robot: Robot, pose: object) -> Float[np.ndarray, "*batch 4 4"]:
     if checked.shape[-2:-1] != (4,):
         raise ValueError(f"pose: must have shape (..., 4, 4), found {checked.shape}")
     rotation = checked[..., :3, :3]
+    determinant = np.linalg.det(rotation)
+    if project:
+        u, _, vt = np.linalg.svd(rotation)
+        rotation = checked[..., :3, :3] = u @ vt
     skew = np.abs(np.swapaxes(rotation, -1, -2) @ rotation - np.eye(3)).max(axis=(-1, -2))
     last_row = np.abs(checked[..., 3, :] - [0, 0, 0, 1]).max(axis=-1)
     distance = distance_from_root(robot, checked)
@@ -46,9 +58,9 @@ def check_pose(robot: Robot, pose: object) -> Float[np.ndarray, "*batch 4 4"]:
             skew,
         ),
         (
-            np.linalg.det(rotation) < 0,
+            determinant <= 0,
             "not a rotation but a reflection: the determinant must be 1, found",
-            np.linalg.det(rotation),
+            determinant,
         ),
         (
             distance > limit,

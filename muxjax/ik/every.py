@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import jax
 import numpy as np
 from jaxtyping import Float, Int
@@ -10,7 +12,10 @@ from muxjax.ik.all_solutions import Found, solutions_of_three
 from muxjax.ik.checks import check_pose
 from muxjax.ik.descent import ORIENTATION_TOLERANCE, POSITION_TOLERANCE
 from muxjax.ik.frames import disc_goals
+from muxjax.ik.goals import check_weights
+from muxjax.ik.levenberg import MOST_SEGMENTS
 from muxjax.ik.result import AllIkResult
+from muxjax.ik.several import solutions_from_table
 from muxjax.robot import Robot
 
 Array = jax.Array | np.ndarray
@@ -18,41 +23,63 @@ Array = jax.Array | np.ndarray
 CHUNK = 1024  # poses at a time
 
 
-def all_ik(robot: Robot, pose: Float[Array, "*batch 4 4"]) -> AllIkResult:
-    """Every configuration within the bending limits that reaches each tool pose, in float64.
+def all_ik(
+    robot: Robot,
+    pose: Float[Array, "*batch 4 4"],
+    *,
+    weights: Float[Array, " 6"] | Sequence[float] | None = None,
+    project_rotations: bool = False,
+) -> AllIkResult:
+    """Configurations within the bending limits that reach each tool pose, in float64.
 
-    Three segments that bend by no more than 180 degrees are searched exhaustively (MODEL.md
-    section 8). ``complete`` is false for poses that have infinitely many solutions, such as a
-    point straight above the root: some of them are returned.
+    For whole poses of three segments that bend by no more than 180 degrees these are all there
+    are: the search is exhaustive (MODEL.md section 8). Other arms and goals get the distinct
+    solutions that a search from many starts finds (``several``): each once where they are
+    isolated, representatives at least ``several.APART`` apart where the goal leaves freedom. One
+    or two segments reach few whole poses: none found is then the usual answer.
+
+    ``complete`` tells whether there can be others. It is false for searches from starts, unless
+    the position is out of reach, and for three segments where infinitely many solutions exist,
+    as for a point straight above the root.
 
     Args:
         robot: The arm; its base and tool frames are included.
         pose: Homogeneous transforms [m], any leading batch axes; checked as by ``solve_ik``.
+        weights: What of the pose counts, as for ``solve_ik``; all of it by default.
+        project_rotations: Take the nearest rotation in place of a 3 x 3 part that is none.
 
     Returns:
-        NumPy float64 arrays. Each solution meets the pose within 1e-10 m and 1e-10 rad; they are
+        NumPy float64 arrays. Each solution meets the goal within 1e-10 m and 1e-10 rad; they are
         ordered by bending, least first.
 
     Raises:
-        ValueError: Another number of segments or wider limits; a pose that cannot be meant (the
-            message names the row); or a call inside a JAX trace: the number of solutions is known
-            only on the host.
+        ValueError: A pose that cannot be meant (the message names the row), bad weights, more
+            than ``MOST_SEGMENTS`` segments, or a call inside a JAX trace: the number of solutions
+            is known only on the host.
     """
     if any(isinstance(x, jax.core.Tracer) for x in jax.tree.leaves((robot, pose))):
         raise ValueError("all_ik: the number of solutions is data, so it cannot be traced")
-    if not is_exhaustive(robot):
-        raise ValueError("all_ik: needs three segments that bend by at most 180 degrees")
-    poses = check_pose(robot, pose)
+    wanted = check_weights(weights)
+    whole = bool((wanted > 0).all())
+    if robot.n_segments > MOST_SEGMENTS:
+        raise ValueError(
+            f"all_ik: is for at most {MOST_SEGMENTS} segments, the robot has {robot.n_segments}"
+        )
+    poses = check_pose(robot, pose, project_rotations)
     batch, flat = poses.shape[:-2], poses.reshape(-1, 4, 4)
     host = jax.tree.map(lambda x: np.asarray(x, np.float64), robot)
     tolerance = (POSITION_TOLERANCE, ORIENTATION_TOLERANCE)
     parts, complete = [], np.ones(len(flat), bool)
     with jax.enable_x64(True):
         for start in range(0, len(flat), CHUNK):
-            goal = disc_goals(host, flat[start : start + CHUNK])
-            found, whole = solutions_of_three(host.length, host.theta_max, goal, tolerance)
+            chunk = flat[start : start + CHUNK]
+            if whole and is_exhaustive(robot):
+                goal = disc_goals(host, chunk)
+                found, certain = solutions_of_three(host.length, host.theta_max, goal, tolerance)
+            else:
+                found, certain = solutions_from_table(host, chunk, wanted, tolerance)
             parts.append(found._replace(row=found.row + start))
-            complete[start : start + CHUNK] = whole
+            complete[start : start + CHUNK] = certain
     result = _packed(host, len(flat), parts, complete)
     return jax.tree.map(lambda x: x.reshape((*batch, *x.shape[1:])), result)
 

@@ -8,25 +8,28 @@ sum (w e)^2, positions over the arm's length and rotations in radians.
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
 from muxjax.batched.formulas import product
-from muxjax.ik.arcs import Array, Numbers, Tip, conjugate, dot, turn_by
+from muxjax.ik.arcs import Array, Numbers, conjugate, dot, turn_by
 from muxjax.ik.frames import inverse, quaternion, without_rounding
+from muxjax.ik.stacked import Placed, Stacked
 from muxjax.precision import host_array
 from muxjax.robot import Robot
+
+Kind = Literal["whole", "position", "pointing", "axes"]
 
 
 class Frames(NamedTuple):
     """The robot's frames as the solver uses them."""
 
-    base: Numbers  # quaternion of the base frame
-    tool: Numbers  # quaternion of the tool in the last disc's frame
-    point: Numbers  # tool point in the last disc's frame [m]
+    base: Float[Array, " 4"]  # quaternion of the base frame
+    tool: Float[Array, " 4"]  # of the tool in the last disc's frame
+    point: Float[Array, " 3"]  # tool point in the last disc's frame [m]
 
 
 def check_weights(weights: object) -> Float[np.ndarray, " 6"]:
@@ -48,13 +51,22 @@ def is_pointing(weights: Float[np.ndarray, " 6"]) -> bool:
     return bool(weights[5] == 0 and weights[3] > 0 and weights[4] > 0)
 
 
+def kind_of(weights: Float[np.ndarray, " 6"]) -> Kind:
+    """How the goal's errors are written down: the fewer rows and turns, the cheaper."""
+    if is_pointing(weights):
+        return "pointing"
+    if (weights[:3] == weights[0]).all() and (weights[3:] == weights[3]).all() and weights[0] > 0:
+        return "whole" if weights[3] > 0 else "position"
+    return "axes"
+
+
 def frames_of(robot: Robot) -> Frames:
     """Quaternions and tool point of a robot."""
     base, tool = np.asarray(robot.base, np.float64), np.asarray(robot.tool, np.float64)
     return Frames(
-        tuple(quaternion(base[None, :3, :3])[:, 0]),
-        tuple(quaternion(tool[None, :3, :3])[:, 0]),
-        tuple(tool[:3, 3]),
+        quaternion(base[None, :3, :3])[:, 0],
+        quaternion(tool[None, :3, :3])[:, 0],
+        tool[:3, 3],
     )
 
 
@@ -65,35 +77,52 @@ def tool_goals(robot: Robot, pose: Float[np.ndarray, "rows 4 4"]) -> Float[np.nd
 
 
 def goal_errors(
-    frames: Frames, tip: Tip, position: Numbers, turn: Numbers, pointing: bool
-) -> tuple[Numbers, Numbers, Numbers]:
-    """Offset [m] in the world, rotation left in the tool's frame, and their Jacobian.
+    frames: Frames, tip: Placed | Stacked, position: Numbers, turn: Numbers, kind: Kind
+) -> Numbers:
+    """Offset [m] and turn that are left: 3 + 3 rows, 3 for ``position``, 3 + 2 for ``pointing``.
 
-    The Jacobian comes as six rows, each an array of shape (2S, ...).
-    The rotation is its axis times twice the sine of half its angle. For ``pointing`` it is that
-    of the shortest turn that takes the tool's z axis to the wanted one.
+    The turn is its axis times twice the sine of half its angle. Axes that count alike need no
+    frame of their own: ``whole`` and ``position`` are in the root's frame. Otherwise the offset is
+    in the world and the turn in the tool's frame; for ``pointing`` it is the shortest turn that
+    takes the tool's z axis to the wanted one.
     """
-    offset = turn_by(frames.base, tuple(a - b for a, b in zip(position, tip.position, strict=True)))
-    own = conjugate(product(tip.quaternion, frames.tool))
-    left = product(own, turn)
+    offset = tuple(a - b for a, b in zip(position, tip.position, strict=True))
+    if kind == "position":
+        return offset
+    facing = product(tip.quaternion, tuple(frames.tool))
+    if kind == "whole":
+        return offset + _doubled(product(turn, conjugate(facing)))
+    offset, left = turn_by(tuple(frames.base), offset), product(conjugate(facing), turn)
+    if kind == "axes":
+        return offset + _doubled(left)
     zero = jnp.zeros_like(left[0])
-    if pointing:
-        x, y, z = turn_by(left, (zero, zero, zero + 1))
-        stretch = jnp.sqrt(2 / jnp.maximum(1 + z, 1e-12))
-        rotation: Numbers = (-stretch * y, stretch * x, zero)
-    else:
-        double = jnp.where(left[0] < 0, -2.0, 2.0)
-        rotation = tuple(double * c for c in left[1:])
-    linear, angular = (
-        tuple(jnp.stack([column[k] for column in columns]) for k in range(3))
-        for columns in (tip.linear, tip.angular)
-    )
-    return offset, rotation, turn_by(frames.base, linear) + turn_by(own, angular)
+    x, y, z = turn_by(left, (zero, zero, zero + 1))
+    stretch = jnp.sqrt(2 / jnp.maximum(1 + z, 1e-12))
+    return (*offset, -stretch * y, stretch * x)
 
 
-def sizes(offset: Numbers, rotation: Numbers, wanted: Float[Array, " 6"]) -> tuple[Array, Array]:
+def goal_rows(frames: Frames, tip: Stacked, kind: Kind) -> Numbers:
+    """Rows of the tip's Jacobian that belong to ``goal_errors``, arrays (S, 2, rows)."""
+    if kind == "position":
+        return tip.linear
+    if kind == "whole":
+        return tip.linear + tip.angular
+    own = conjugate(product(tip.quaternion, tuple(frames.tool)))
+    count = 2 if kind == "pointing" else 3
+    return turn_by(tuple(frames.base), tip.linear) + turn_by(own, tip.angular)[:count]
+
+
+def _doubled(left: Numbers) -> Numbers:
+    """Axis times twice the sine of half the angle, of the shorter of both turns."""
+    double = jnp.where(left[0] < 0, -2.0, 2.0)
+    return tuple(double * c for c in left[1:])
+
+
+def sizes(errors: Numbers, wanted: Float[Array, " 6"]) -> tuple[Array, Array]:
     """Position error [m] and angle [rad] over the axes with ``wanted`` = 1 (others 0)."""
-    moved = tuple(wanted[k] * x for k, x in enumerate(offset))
-    turned = tuple(wanted[3 + k] * x for k, x in enumerate(rotation))
-    half = jnp.minimum(0.5 * jnp.sqrt(dot(turned, turned)), 1.0)
-    return jnp.sqrt(dot(moved, moved)), 2 * jnp.arcsin(half)
+    counted = [wanted[k] * x for k, x in enumerate(errors)]
+    half = jnp.zeros_like(errors[0])
+    if len(counted) > 3:
+        half = 0.5 * jnp.sqrt(dot(tuple(counted[3:]), tuple(counted[3:])))
+    position = jnp.sqrt(dot(tuple(counted[:3]), tuple(counted[:3])))
+    return position, 2 * jnp.arcsin(jnp.minimum(half, 1.0))

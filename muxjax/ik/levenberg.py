@@ -1,39 +1,40 @@
-"""Levenberg-Marquardt in Cartesian bending, started from a table of poses.
+"""Levenberg-Marquardt in Cartesian bending, for any number of segments and any goal.
 
-For arms of any number of segments and for partial goals (``goals``). A table of configurations
-within the limits is kept for each robot with its poses; those whose poses are nearest to the goal
-are the starts. A step is
+A step is
 
     db = mu + J' (J J' + damping |r|^2)^-1 (r - J mu)
 
-with mu the pull towards the reference, which only what the goal leaves free can follow.
+with r the goal's weighted errors and mu a pull towards a reference, which only what the goal
+leaves free can follow. Steps are taken boldly, uphill too, where a solution is looked for. The
+closest configuration to a goal out of reach is looked for downhill: a step that does not descend
+is drawn back. A segment at its limit that is pulled outwards only turns about its base: without
+this the steps would rely on a bending that the limits then take away.
 """
 
 from __future__ import annotations
 
-from functools import lru_cache, partial
+from functools import partial
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Float
-from scipy.spatial import cKDTree
-from scipy.stats import qmc
+from jaxtyping import Bool, Float
 
-from muxjax.batched import WIDE_VECTORS, poses
-from muxjax.ik.arcs import Array, Numbers, dot, solve_symmetric, tip_and_twists
-from muxjax.ik.frames import inverse, quaternion
-from muxjax.ik.goals import Frames, frames_of, goal_errors, is_pointing, sizes
-from muxjax.ik.newton import FLOOR, clipped, in_pieces, padded
+from muxjax.batched import WIDE_VECTORS
+from muxjax.ik.arcs import Array, dot
+from muxjax.ik.goals import Frames, Kind, frames_of, goal_errors, goal_rows, kind_of, sizes
+from muxjax.ik.newton import FLOOR, padded, within
+from muxjax.ik.stacked import eliminated, stacked_pose, stacked_tip
 from muxjax.robot import Robot
 
 MOST_SEGMENTS = 8  # the written-out code grows with the square of the segments
-ENTRIES = 1 << 16  # of the table
-STEPS = 40
 DAMPING = 0.1
 PULL = 0.5  # of the reference, times the error (at most 1)
+DRAWN_BACK = 0.25  # what is left of a step that did not descend
+AT_LIMIT = 1 - 1e-12  # of its limit, from which a segment lies on it
+ROWS = 128  # configurations a call: one size is ever compiled
 
 
 class Reached(NamedTuple):
@@ -45,149 +46,113 @@ class Reached(NamedTuple):
     merit: Float[np.ndarray, " rows"]  # in the goal's metric
 
 
-class Table(NamedTuple):
-    """Configurations and their tool poses from the root."""
-
-    b: Float[np.ndarray, "dof entries"]
-    position: Float[np.ndarray, "entries 3"]
-    quaternion: Float[np.ndarray, "4 entries"]
+def scales(weights: Array, length: Array, rows: int) -> list[Array]:
+    """What an error is multiplied by in the goal's metric."""
+    scale = 1 / jnp.sum(length)
+    return [weights[k] * (scale if k < 3 else 1.0) for k in range(rows)]
 
 
-def table(robot: Robot) -> Table:
-    """The robot's table; made once for each set of lengths, limits and tool."""
-    key = (robot.length, robot.theta_max, robot.base, robot.tool)
-    return _table(robot.config, *(np.asarray(x, np.float64).tobytes() for x in key))(robot)
-
-
-@lru_cache(maxsize=8)
-def _table(*_: object):  # type: ignore[no-untyped-def]
-    made: list[Table] = []
-
-    def get(robot: Robot) -> Table:
-        if not made:
-            made.append(_make(robot))
-        return made[0]
-
-    return get
-
-
-def _make(robot: Robot) -> Table:
-    s = robot.n_segments
-    unit = qmc.Sobol(2 * s, scramble=False).random(ENTRIES)
-    theta, phi = robot.theta_max * unit[:, :s], 2 * np.pi * unit[:, s:]
-    b = np.stack([theta * np.cos(phi), theta * np.sin(phi)], axis=-1)
-    frames = poses(robot, b.astype(np.float32), "matrix").astype(np.float64)
-    inner = inverse(np.asarray(robot.base)) @ frames
-    return Table(b.reshape(ENTRIES, -1).T, inner[:, :3, 3], quaternion(inner[:, :3, :3]))
-
-
-_trees: dict[tuple[int, bytes], tuple[Table, cKDTree]] = {}
-
-
-def nearest_entries(
-    robot: Robot,
-    goal: Float[np.ndarray, "7 rows"],
-    weights: Float[np.ndarray, " 6"],
-    count: int,
-) -> Float[np.ndarray, "dof rows count"]:
-    """Bending of the entries whose poses are nearest to each goal."""
-    entries = table(robot)
-    key = (id(entries), weights.tobytes())
-    if key not in _trees:
-        if len(_trees) >= 8:
-            _trees.pop(next(iter(_trees)))
-        features = _features(robot, entries.position, entries.quaternion, weights)
-        _trees[key] = entries, cKDTree(features, balanced_tree=False)
-    wanted = _features(robot, goal[:3].T, goal[3:], weights)
-    _, index = _trees[key][1].query(wanted, k=np.arange(1, count + 1))
-    return entries.b[:, index]
-
-
-def _features(
-    robot: Robot,
-    position: Float[np.ndarray, "rows 3"],
-    turn: Float[np.ndarray, "4 rows"],
-    weights: Float[np.ndarray, " 6"],
-) -> Float[np.ndarray, "rows features"]:
-    """Numbers whose distance is about the goal's metric."""
-    w, x, y, z = turn
-    scaled = position * weights[:3] / np.sum(robot.length)
-    if not weights[3:].any():
-        return scaled
-    if is_pointing(weights):
-        axis = np.stack([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)])
-        return np.concatenate([scaled, weights[3] * axis.T], axis=1)
-    sign = np.where(w < 0, -1.0, 1.0)
-    return np.concatenate([scaled, 2 * weights[3:].max() * (sign * turn).T], axis=1)
-
-
-@partial(jax.jit, static_argnames="pointing", compiler_options=WIDE_VECTORS)
+@partial(jax.jit, static_argnames=("kind", "pulled"), compiler_options=WIDE_VECTORS)
 def _descend(
     length: Float[Array, " S"],
     theta_max: Float[Array, " S"],
     frames: Frames,
-    b: Numbers,
-    reference: Numbers,
-    goal: Numbers,
+    b: Float[Array, "S 2 rows"],
+    reference: Float[Array, "S 2 rows"],
+    goal: Float[Array, "7 rows"],
     weights: Float[Array, " 6"],
     steps: Array | int,
-    pointing: bool,
-) -> tuple[Numbers, Array, Array, Array]:
-    """The configuration of least merit on the way, its position error, angle and merit."""
-    scale = 1 / jnp.sum(length)
-    rows = [weights[k] * (scale if k < 3 else 1.0) for k in range(6)]
-    wanted = jnp.where(weights > 0, 1.0, 0.0)
+    downhill: Array | bool,
+    kind: Kind,
+    pulled: bool,
+) -> tuple[Array, Array]:
+    """The configuration after so many steps (downhill, the best on the way), and its errors."""
+    position, turn = tuple(goal[:3]), tuple(goal[3:])
 
-    def look(b: Numbers) -> tuple[list[Array], list[Array], Array, Array]:
-        # The barriers keep XLA from computing these anew for each of their many uses, which would
-        # take it a minute to compile for five segments.
-        tip = lax.optimization_barrier(tip_and_twists(length, b, frames.point))
-        offset, rotation, jacobian = goal_errors(frames, tip, goal[:3], goal[3:], pointing)
-        r = [w * e for w, e in zip(rows, offset + rotation, strict=True)]
-        weighted = [w * e for w, e in zip(rows, jacobian, strict=True)]
-        r, weighted = lax.optimization_barrier((r, weighted))
-        return r, weighted, *sizes(offset, rotation, wanted)
+    def body(_: Array | int, state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
+        b, best, least = state
+        tip = stacked_tip(length, b, tuple(frames.point))
+        errors = goal_errors(frames, tip, position, turn, kind)
+        rows = goal_rows(frames, tip, kind)
+        factors = scales(weights, length, len(errors))
+        r = jnp.stack([w * e for w, e in zip(factors, errors, strict=True)])
+        jac = jnp.stack([w * e for w, e in zip(factors, rows, strict=True)])
+        r, jac = lax.optimization_barrier((r, jac))
+        merit = lax.optimization_barrier(jnp.sum(r * r, axis=0))
+        back = downhill & ~(merit < least)
+        pull = jnp.where(downhill, 0.0, PULL * jnp.minimum(1.0, jnp.sqrt(merit)))
+        mu = pull * (reference - b) if pulled else None
+        step = _step(_free(b, theta_max, jac, r), r, DAMPING * merit + FLOOR, mu)
+        best = jnp.where(back, best, b)
+        ahead = within(b + lax.optimization_barrier(step), theta_max)
+        ahead = jnp.where(back, best + DRAWN_BACK * (b - best), ahead)
+        return lax.optimization_barrier((ahead, best, jnp.where(back, least, merit)))
 
-    def body(_: Array | int, state: tuple[Numbers, Numbers, Numbers]) -> tuple[Numbers, ...]:
-        b, best, known = state
-        r, jacobian, position, angle = look(b)
-        merit = dot(tuple(r), tuple(r))
-        better = merit < known[0]
-        best = tuple(jnp.where(better, x, old) for x, old in zip(b, best, strict=True))
-        known = tuple(
-            jnp.where(better, x, old)
-            for x, old in zip((merit, position, angle), known, strict=True)
-        )
-        pull = PULL * jnp.minimum(1.0, jnp.sqrt(merit))
-        mu = pull * (jnp.stack(reference) - jnp.stack(b))
-        step = _step(jacobian, r, DAMPING * merit + FLOOR, mu)
-        return (
-            clipped(tuple(x + dx for x, dx in zip(b, step, strict=True)), theta_max),
-            best,
-            known,
-        )
-
-    far = jnp.full_like(b[0], jnp.inf)
-    _, best, known = lax.fori_loop(0, steps, body, (b, b, (far, far, far)))
-    return best, known[1], known[2], known[0]
+    far = jnp.full_like(b[0, 0], jnp.inf)
+    last, best, _ = lax.fori_loop(0, steps, body, (b, b, far))
+    chosen = lax.optimization_barrier(jnp.where(downhill, best, last))
+    return chosen, _judged(length, frames, chosen, goal, weights, kind)
 
 
-def _step(jacobian: list[Array], r: list[Array], damping: Array, mu: Array) -> list[Array]:
-    """The smaller of the two equal systems is solved: 6 rows or 2S columns."""
-    n = mu.shape[0]
-    if n < 6:
-        rows = [tuple(row[i] for row in jacobian) for i in range(n)]
-        gram = [[dot(a, b) for b in rows[: i + 1]] for i, a in enumerate(rows)]
-        for i in range(n):
-            gram[i][i] = gram[i][i] + damping
-        return solve_symmetric(gram, [dot(row, tuple(r)) for row in rows])
-    rest = [e - jnp.sum(row * mu, axis=0) for e, row in zip(r, jacobian, strict=True)]
-    gram = [[jnp.sum(jacobian[i] * jacobian[j], axis=0) for j in range(i + 1)] for i in range(6)]
-    for i in range(6):
-        gram[i][i] = gram[i][i] + damping
-    y = lax.optimization_barrier(solve_symmetric(gram, rest))
-    change = mu + sum((row * c for row, c in zip(jacobian, y, strict=True)), start=0.0)
-    return [change[k] for k in range(n)]
+def _judged(
+    length: Float[Array, " S"],
+    frames: Frames,
+    b: Float[Array, "S 2 rows"],
+    goal: Float[Array, "7 rows"],
+    weights: Float[Array, " 6"],
+    kind: Kind,
+) -> Array:
+    """Position error, angle and merit, stacked."""
+    tip = stacked_pose(length, b, tuple(frames.point))
+    errors = lax.optimization_barrier(
+        goal_errors(frames, tip, tuple(goal[:3]), tuple(goal[3:]), kind)
+    )
+    factors = scales(weights, length, len(errors))
+    r = tuple(w * e for w, e in zip(factors, errors, strict=True))
+    return jnp.stack([*sizes(errors, jnp.where(weights > 0, 1.0, 0.0)), dot(r, r)])
+
+
+def _free(
+    b: Float[Array, "S 2 rows"],
+    theta_max: Float[Array, " S"],
+    jac: Float[Array, "m S 2 rows"],
+    r: Float[Array, "m rows"],
+) -> Array:
+    """The Jacobian without the outward direction of segments that are held at their limit."""
+    slope = jnp.sum(jac * r[:, None, None], axis=0)
+    square = jnp.sum(b * b, axis=1)
+    limit = (jnp.asarray(theta_max) * AT_LIMIT)[:, None]
+    held = (square >= limit * limit) & (jnp.sum(b * slope, axis=1) > 0)
+    inverse = jnp.where(held, 1 / jnp.where(held, square, 1.0), 0.0)
+    inverse = lax.optimization_barrier(inverse)
+    along = lax.optimization_barrier(inverse * jnp.sum(jac * b, axis=2))
+    return lax.optimization_barrier(jac - along[:, :, None] * b)
+
+
+def _step(
+    jac: Float[Array, "m S 2 rows"],
+    r: Float[Array, "m rows"],
+    damping: Float[Array, " rows"],
+    mu: Float[Array, "S 2 rows"] | None,
+) -> Array:
+    """The smaller of two equal systems is solved; without freedom there is no pull."""
+    shape, m = jac.shape[1:], len(r)
+    flat = jac.reshape(m, -1, shape[-1])
+    n = flat.shape[1]
+    if mu is None and n <= m:
+        gram = jnp.sum(flat[:, :, None] * flat[:, None], axis=0)
+        slope = jnp.sum(flat * r[:, None], axis=0)
+        damped = lax.optimization_barrier((_damped(gram, damping), slope))
+        return eliminated(*damped).reshape(shape)
+    pull = jnp.zeros_like(flat[0]) if mu is None else mu.reshape(flat.shape[1:])
+    rest = r - jnp.sum(flat * pull, axis=1)
+    gram = jnp.sum(flat[:, None] * flat[None], axis=2)
+    y = eliminated(*lax.optimization_barrier((_damped(gram, damping), rest)))
+    return (pull + jnp.sum(flat * y[:, None], axis=0)).reshape(shape)
+
+
+def _damped(gram: Float[Array, "n n rows"], damping: Float[Array, " rows"]) -> Array:
+    return gram + jnp.eye(len(gram))[..., None] * damping
 
 
 def levenberg(
@@ -196,7 +161,8 @@ def levenberg(
     reference: Float[np.ndarray, "dof rows"],
     goal: Float[np.ndarray, "7 rows"],
     weights: Float[np.ndarray, " 6"],
-    steps: int = STEPS,
+    steps: int,
+    downhill: bool = False,
 ) -> Reached:
     """Steps from every start; call inside an x64 context.
 
@@ -207,17 +173,38 @@ def levenberg(
         goal: Of the tool from the root, position [m] and quaternion.
         weights: Of the goal.
         steps: Of them.
+        downhill: Never up, and without the pull of the reference: for goals out of reach.
     """
     ends, known = np.empty_like(start), np.empty((3, start.shape[1]))
-    frames, pointing = frames_of(robot), is_pointing(weights)
-    for piece, size in in_pieces(start.shape[1]):
-        parts = [tuple(padded(x[:, piece], size)) for x in (start, reference, goal)]
-        best, *errors = _descend(
-            robot.length, robot.theta_max, frames, *parts, weights, steps, pointing=pointing
+    shape = (robot.n_segments, 2, ROWS)
+    # Put on the device once: every array from the host costs a call ten microseconds.
+    fixed = jax.device_put(
+        (robot.length, robot.theta_max, frames_of(robot), weights, steps, downhill)
+    )
+    length, theta_max, frames, metric, count, down = fixed
+    kind, pulled = kind_of(weights), bool(np.count_nonzero(weights) < len(start))
+    for first in range(0, start.shape[1], ROWS):
+        piece = slice(first, first + ROWS)
+        b, near, to = (padded(x[:, piece], ROWS) for x in (start, reference, goal))
+        last, errors = _descend(
+            length,
+            theta_max,
+            frames,
+            b.reshape(shape),
+            near.reshape(shape),
+            to,
+            metric,
+            count,
+            down,
+            kind=kind,
+            pulled=pulled,
         )
-        count = piece.stop - piece.start
-        for row, values in enumerate(best):
-            ends[row, piece] = np.asarray(values)[:count]
-        for row, values in enumerate(errors):
-            known[row, piece] = np.asarray(values)[:count]
+        here = min(ROWS, start.shape[1] - first)
+        ends[:, piece] = np.asarray(last).reshape(-1, ROWS)[:, :here]
+        known[:, piece] = np.asarray(errors)[:, :here]
     return Reached(ends, *known)
+
+
+def reached(found: Reached, tolerance: tuple[float, float]) -> Bool[np.ndarray, " rows"]:
+    """Both errors below their tolerances, [m] and [rad]."""
+    return (found.position < tolerance[0]) & (found.angle < tolerance[1])

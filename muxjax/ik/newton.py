@@ -18,27 +18,14 @@ from jax import lax
 from jaxtyping import Bool, Float
 
 from muxjax.batched import WIDE_VECTORS
-from muxjax.ik.arcs import (
-    Array,
-    Numbers,
-    Tip,
-    conjugate,
-    dot,
-    product,
-    solve_symmetric,
-    tip_and_twists,
-)
+from muxjax.batched.formulas import product
+from muxjax.ik.arcs import Array, conjugate
+from muxjax.ik.stacked import Placed, Stacked, eliminated, stacked_pose, stacked_tip
 
 FLOOR = 1e-20  # added to J'J, whose entries are about 1
 INVERSE_ITERATIONS = 24  # for the smallest singular value
-ROWS = (16, 512)  # configurations a call: two sizes are ever compiled
-
-
-class Goal(NamedTuple):
-    """Poses of the last disc in the root's frame, each entry an array of one shape."""
-
-    position: Numbers  # [m]
-    quaternion: Numbers  # (w, x, y, z)
+ROWS = (16, 128)  # configurations a call: two sizes are ever compiled
+NO_TOOL = (np.zeros(()),) * 3
 
 
 class Solved(NamedTuple):
@@ -47,87 +34,81 @@ class Solved(NamedTuple):
     b: Float[np.ndarray, "dof rows"]  # Cartesian bending [rad]
     position: Float[np.ndarray, " rows"]  # error [m]
     angle: Float[np.ndarray, " rows"]  # error [rad]
-    singular: Float[np.ndarray, " rows"]  # smallest singular value of J, unit total length
 
 
-def _errors(scale: Array, tip: Tip, goal: Goal) -> list[Array]:
-    turn = product(goal.quaternion, conjugate(tip.quaternion))
+def _errors(scale: Array, tip: Placed | Stacked, goal: Float[Array, "7 rows"]) -> Array:
+    turn = product(tuple(goal[3:]), conjugate(tip.quaternion))
     double = jnp.where(turn[0] < 0, -2.0, 2.0)
-    offset = [scale * (a - b) for a, b in zip(goal.position, tip.position, strict=True)]
-    return offset + [double * x for x in turn[1:]]
+    offset = [scale * (goal[k] - tip.position[k]) for k in range(3)]
+    return lax.optimization_barrier(jnp.stack(offset + [double * x for x in turn[1:]]))
 
 
-def _columns(scale: Array, tip: Tip) -> list[Numbers]:
-    return [
-        tuple(scale * x for x in linear) + angular
-        for linear, angular in zip(tip.linear, tip.angular, strict=True)
-    ]
+def _jacobian(scale: Array, tip: Stacked) -> Array:
+    """Columns by rows, (6, 2S, configurations)."""
+    jac = jnp.stack([scale * x for x in tip.linear] + list(tip.angular))
+    return lax.optimization_barrier(jac.reshape(6, -1, jac.shape[-1]))
 
 
-def _gram(columns: list[Numbers], floor: Array | float) -> list[list[Array]]:
-    """Lower half of J'J + floor."""
-    rows = [[dot(a, b) for b in columns[: i + 1]] for i, a in enumerate(columns)]
-    for i, row in enumerate(rows):
-        row[i] = row[i] + floor
-    return rows
+def _gram(jac: Float[Array, "m n rows"], floor: Array | float) -> Array:
+    """J'J + floor."""
+    gram = jnp.sum(jac[:, :, None] * jac[:, None], axis=0)
+    return lax.optimization_barrier(gram + floor * jnp.eye(jac.shape[1])[..., None])
 
 
 @partial(jax.jit, compiler_options=WIDE_VECTORS)
 def _iterate(
     length: Float[Array, " S"],
-    b: Numbers,
-    goal: Goal,
+    b: Float[Array, "dof rows"],
+    goal: Float[Array, "7 rows"],
     damping: Array,
     theta_max: Float[Array, " S"],
     steps: Array | int,
-) -> Numbers:
-    """``steps`` damped steps, each kept within the limits (infinite ones leave them out)."""
-    scale = 1 / jnp.sum(length)
+) -> tuple[Array, Array]:
+    """``steps`` damped steps, each kept within the limits; and the errors where they end."""
+    scale, shape = 1 / jnp.sum(length), (len(length), 2, b.shape[-1])
 
-    def body(_: Array | int, b: Numbers) -> Numbers:
-        tip = tip_and_twists(length, b)
-        r, columns = _errors(scale, tip, goal), _columns(scale, tip)
-        merit = dot(tuple(r), tuple(r))
-        slope = [dot(column, tuple(r)) for column in columns]
-        step = solve_symmetric(_gram(columns, damping * merit + FLOOR), slope)
-        return clipped(tuple(x + dx for x, dx in zip(b, step, strict=True)), theta_max)
+    def body(_: Array | int, b: Array) -> Array:
+        tip = stacked_tip(length, b, NO_TOOL)
+        r, jac = _errors(scale, tip, goal), _jacobian(scale, tip)
+        merit = jnp.sum(r * r, axis=0)
+        slope = jnp.sum(jac * r[:, None], axis=0)
+        step = eliminated(_gram(jac, damping * merit + FLOOR), lax.optimization_barrier(slope))
+        return within(b + step.reshape(shape), theta_max)
 
-    return lax.fori_loop(0, steps, body, b)
+    last = lax.optimization_barrier(lax.fori_loop(0, steps, body, b.reshape(shape)))
+    r = _errors(scale, stacked_pose(length, last, NO_TOOL), goal)
+    position = jnp.sqrt(jnp.sum(r[:3] ** 2, axis=0)) / scale
+    half = 0.5 * jnp.sqrt(jnp.sum(r[3:] ** 2, axis=0))
+    angle = 2 * jnp.arcsin(jnp.minimum(half, 1.0))
+    return last.reshape(b.shape), jnp.stack([position, angle])
 
 
-def clipped(b: Numbers, theta_max: Float[Array, " S"]) -> Numbers:
-    """Each bending shortened to its limit."""
-    kept: list[Array] = []
-    for i in range(len(b) // 2):
-        x, y = b[2 * i : 2 * i + 2]
-        theta = jnp.sqrt(x * x + y * y)
-        shorter = jnp.where(theta > theta_max[i], theta_max[i] / theta, 1.0)
-        kept += [shorter * x, shorter * y]
-    return tuple(kept)
+def within(b: Float[Array, "S 2 rows"], theta_max: Float[Array, " S"]) -> Array:
+    """Each bending shortened to its limit (infinite ones leave it as it is)."""
+    theta = jnp.sqrt(jnp.sum(b * b, axis=1, keepdims=True))
+    limit = jnp.asarray(theta_max)[:, None, None]
+    beyond = theta > limit
+    return b * jnp.where(beyond, limit / jnp.where(beyond, theta, 1.0), 1.0)
 
 
 @partial(jax.jit, compiler_options=WIDE_VECTORS)
-def _judge(length: Float[Array, " S"], b: Numbers, goal: Goal) -> tuple[Array, Array, Array]:
-    """Position error [m], angle [rad] and smallest singular value."""
-    scale = 1 / jnp.sum(length)
-    tip = tip_and_twists(length, b)
-    r = _errors(scale, tip, goal)
-    gram = _gram(_columns(scale, tip), FLOOR)
+def _smallest(length: Float[Array, " S"], b: Float[Array, "dof rows"]) -> Array:
+    """Smallest singular value of J, by iteration with the inverse of J'J."""
+    n, rows = b.shape
+    tip = stacked_tip(length, b.reshape(-1, 2, rows), NO_TOOL)
+    gram = _gram(_jacobian(1 / jnp.sum(length), tip), FLOOR)
+    unit = jnp.broadcast_to(jnp.eye(n)[..., None], gram.shape)
+    inverse = eliminated(gram, unit)
 
-    def body(_: Array | int, carried: tuple[Numbers, Array]) -> tuple[Numbers, Array]:
-        x = carried[0]
-        y = solve_symmetric(gram, list(x))
-        growth = jnp.sqrt(dot(tuple(y), tuple(y)))
-        return tuple(value / growth for value in y), growth
+    def body(_: Array | int, state: tuple[Array, Array]) -> tuple[Array, Array]:
+        x = jnp.sum(inverse * state[0], axis=1)
+        growth = jnp.sqrt(jnp.sum(x * x, axis=0))
+        return lax.optimization_barrier((x / growth, growth))
 
-    start = tuple(jnp.full_like(b[0], (-0.7) ** k) for k in range(len(b)))
-    norm = jnp.sqrt(dot(start, start))
-    start = tuple(x / norm for x in start)
-    _, growth = lax.fori_loop(0, INVERSE_ITERATIONS, body, (start, norm))
-    position = jnp.sqrt(dot(tuple(r[:3]), tuple(r[:3]))) / scale
-    half = 0.5 * jnp.sqrt(dot(tuple(r[3:]), tuple(r[3:])))
-    angle = 2 * jnp.arcsin(jnp.minimum(half, 1.0))
-    return position, angle, jnp.sqrt(1 / growth)
+    start = jnp.broadcast_to(((-0.7) ** jnp.arange(n))[:, None], b.shape)
+    first = start / jnp.sqrt(jnp.sum(start * start, axis=0))
+    _, growth = lax.fori_loop(0, INVERSE_ITERATIONS, body, (first, jnp.ones(rows)))
+    return jnp.sqrt(1 / growth)
 
 
 def in_pieces(rows: int) -> list[tuple[slice, int]]:
@@ -154,44 +135,41 @@ def newton(
     goal: Float[np.ndarray, "7 rows"],
     *,
     steps: int,
-    damping: float,
+    damping: float = 0.0,
     theta_max: Float[np.ndarray, " S"] | None = None,
-) -> Float[np.ndarray, "dof rows"]:
-    """Bending after a number of steps; call inside an x64 context.
+) -> Solved:
+    """Bending after a number of steps, and its errors; call inside an x64 context.
 
     Args:
         length: L_i [m].
         b: Start.
         goal: Position [m] and quaternion (w, x, y, z) of the last disc, in the root's frame.
-        steps: Of them.
+        steps: Of them; 0 only judges.
         damping: Times |r|^2.
         theta_max: Limits to stay within [rad]; none by default.
     """
-    ends = np.empty_like(b)
+    ends, known = np.empty_like(b), np.empty((2, b.shape[1]))
     limits = np.full(len(length), np.inf) if theta_max is None else theta_max
+    # Put on the device once: every array from the host costs a call ten microseconds.
+    arm, factor, bound, count = jax.device_put((length, damping, limits, steps))
     for piece, size in in_pieces(b.shape[1]):
-        part, target = padded(b[:, piece], size), padded(goal[:, piece], size)
-        found = _iterate(
-            length, tuple(part), Goal(tuple(target[:3]), tuple(target[3:])), damping, limits, steps
-        )
-        for row, values in enumerate(found):
-            ends[row, piece] = np.asarray(values)[: piece.stop - piece.start]
-    return ends
+        start, target = padded(b[:, piece], size), padded(goal[:, piece], size)
+        last, errors = _iterate(arm, start, target, factor, bound, count)
+        here = piece.stop - piece.start
+        ends[:, piece] = np.asarray(last)[:, :here]
+        known[:, piece] = np.asarray(errors)[:, :here]
+    return Solved(ends, *known)
 
 
-def judge(
-    length: Float[np.ndarray, " S"],
-    b: Float[np.ndarray, "dof rows"],
-    goal: Float[np.ndarray, "7 rows"],
-) -> Solved:
-    """Errors and smallest singular value of configurations; arguments as for ``newton``."""
-    known = np.empty((3, b.shape[1]))
+def smallest_singular(
+    length: Float[np.ndarray, " S"], b: Float[np.ndarray, "dof rows"]
+) -> Float[np.ndarray, " rows"]:
+    """Smallest singular value of the Jacobian, arm length 1 and rad; call inside x64."""
+    found = np.empty(b.shape[1])
     for piece, size in in_pieces(b.shape[1]):
-        part, target = padded(b[:, piece], size), padded(goal[:, piece], size)
-        found = _judge(length, tuple(part), Goal(tuple(target[:3]), tuple(target[3:])))
-        for row, values in enumerate(found):
-            known[row, piece] = np.asarray(values)[: piece.stop - piece.start]
-    return Solved(b, *known)
+        values = np.asarray(_smallest(length, padded(b[:, piece], size)))
+        found[piece] = values[: piece.stop - piece.start]
+    return found
 
 
 def solved(at: Solved, position: float, angle: float) -> Bool[np.ndarray, " rows"]:

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Literal, get_args
+from collections.abc import Mapping, Sequence
+from typing import Literal, NamedTuple, get_args
 
 import equinox as eqx
 import jax
@@ -11,16 +11,25 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, PRNGKeyArray
 
-from muxjax.collision import CAPSULES, World, part_clearances
+from muxjax.collision import World
 from muxjax.ik.checks import check_pose, check_reference
+from muxjax.ik.clear import (
+    Candidates,
+    Chosen,
+    Prefer,
+    check_prefer,
+    choose,
+    climb,
+    of_all,
+    of_descents,
+)
 from muxjax.ik.descent import STARTS, solve_by_descent, solve_traced
 from muxjax.ik.every import all_ik, is_exhaustive
 from muxjax.ik.goals import check_weights
 from muxjax.ik.implicit import attach_derivatives
 from muxjax.ik.levenberg import MOST_SEGMENTS
-from muxjax.ik.result import AllIkResult, IkResult, IkStatus
+from muxjax.ik.result import IkResult, IkStatus
 from muxjax.ik.seeded import bending_of, closest, from_table
-from muxjax.precision import pad_rows
 from muxjax.robot import Robot
 
 Array = jax.Array | np.ndarray
@@ -34,11 +43,13 @@ def solve_ik(
     q0: Float[Array, "*#batch dof"] | None = None,
     world: World | None = None,
     weights: Float[Array, " 6"] | Sequence[float] | None = None,
+    prefer: Prefer = "distance",
     method: Method = "auto",
     key: PRNGKeyArray | None = None,
     starts: int = STARTS,
+    project_rotations: bool = False,
 ) -> IkResult:
-    """One configuration for each tool pose, in float64: the nearest to a reference.
+    """One configuration for each tool pose, in float64: the nearest to a reference, or the best.
 
     Args:
         robot: The arm; its base and tool frames are included.
@@ -46,11 +57,16 @@ def solve_ik(
             rounding (``checks.ROTATION_TOLERANCE``) are orthonormalised first.
         q0: Configuration [rad] to stay near, broadcast against the batch of poses; the straight
             arm by default. Near means in the Cartesian bending of all segments.
-        world: Obstacles. Only clear solutions are chosen from; where all collide the one of least
-            depth is returned, with ``converged`` false and status BLOCKED. Three segments only.
+        world: Obstacles. Only clear solutions are chosen from. Where a goal leaves freedom and
+            no solution found is clear, they are moved away from the obstacles within it. If all
+            still collide, the one of least depth is returned, with ``converged`` false, status
+            BLOCKED and where it touches.
         weights: What of the pose counts, as ``goals`` describes: (1, 1, 1, 0, 0, 0) is a position,
             (1, 1, 1, 1, 1, 0) a position and the direction of the tool's z axis. Freedom that is
             left goes to the reference.
+        prefer: What is best among several solutions: ``"distance"`` from q0, least ``"bending"``,
+            most ``"clearance"`` (with a world), or weights of these by name; ``clear.choose``
+            has their units. Anything but the distance alone looks at several solutions.
         method: ``"all"``: choose among all solutions (three segments only);
             ``"levenberg_marquardt"``: from the nearest poses of a table, any goal;
             ``"pseudo_inverse"``: the paper's iteration, whole poses only; ``"auto"``: the first
@@ -58,6 +74,7 @@ def solve_ik(
         key: JAX random key of the starts of ``"pseudo_inverse"``; ``jax.random.key(0)`` by
             default, so that the same call gives the same answer.
         starts: Descents a pose at most, for ``"pseudo_inverse"``.
+        project_rotations: Take the nearest rotation where a matrix is not quite one.
 
     Returns:
         NumPy float64 arrays. A pose that was not reached has ``converged`` false and the closest
@@ -77,10 +94,12 @@ def solve_ik(
         raise ValueError(f"starts: must be at least 1, found {starts}")
     if method not in get_args(Method):
         raise ValueError(f"method: must be one of {', '.join(get_args(Method))}, found {method!r}")
-    wanted = check_weights(weights)
+    wanted, liked = check_weights(weights), check_prefer(prefer, world)
     if any(isinstance(x, jax.core.Tracer) for x in jax.tree.leaves((robot, pose, q0, key))):
         if world is not None:
-            raise ValueError("world: the choice among all solutions cannot be traced")
+            raise ValueError("world: the choice among several solutions cannot be traced")
+        if liked.keys() != {"distance"}:
+            raise ValueError("prefer: a trace has only the distance")
         if method not in ("auto", "pseudo_inverse") or (wanted != 1).any():
             raise ValueError("solve_ik: a trace has only whole poses and method 'pseudo_inverse'")
         # Only tracers carry derivatives; the robot's NumPy leaves stay what they are.
@@ -92,23 +111,15 @@ def solve_ik(
         return eqx.tree_at(
             lambda r: r.q, found, attach_derivatives(robot, jnp.asarray(pose), found.q)
         )
-    poses = check_pose(robot, pose)
+    poses = check_pose(robot, pose, project_rotations)
     batch = poses.shape[:-2]
     reference = check_reference(robot, q0, batch).reshape(-1, 2 * robot.n_segments)
     poses = poses.reshape(-1, 4, 4)
     host = jax.tree.map(lambda x: np.asarray(x, np.float64), robot)
     fitting = _fitting(host, method, wanted)
-    if world is not None and fitting != "all":
-        raise ValueError(
-            f"world: needs method 'all', which looks at every solution, not {fitting!r}"
-        )
-    match fitting:
-        case "all":
-            flat = _from_all(host, poses, reference, world, key, starts)
-        case "pseudo_inverse":
-            flat = solve_by_descent(host, poses, reference, key, starts)
-        case _:
-            flat = from_table(host, poses, reference, wanted)
+    search = _Search(host, poses, reference, wanted, fitting, key, starts)
+    flat = _nearest(search) if world is None and liked.keys() == {"distance"} else None
+    flat = _best(search, liked, world) if flat is None else flat
     return jax.tree.map(lambda x: x.reshape((*batch, *x.shape[1:])), flat)
 
 
@@ -132,83 +143,121 @@ def _fitting(robot: Robot, method: Method, weights: Float[np.ndarray, " 6"]) -> 
     return method
 
 
-def _from_all(
-    robot: Robot,
-    poses: Float[np.ndarray, "rows 4 4"],
-    reference: Float[np.ndarray, "rows dof"],
-    world: World | None,
-    key: PRNGKeyArray | None,
-    starts: int,
-) -> IkResult:
+class _Search(NamedTuple):
+    """What one call looks for, and how."""
+
+    robot: Robot
+    poses: Float[np.ndarray, "rows 4 4"]
+    reference: Float[np.ndarray, "rows dof"]
+    weights: Float[np.ndarray, " 6"]
+    method: str
+    key: PRNGKeyArray | None
+    starts: int
+
+    def only(self, rows: np.ndarray) -> _Search:
+        """The search for some of the poses."""
+        return self._replace(poses=self.poses[rows], reference=self.reference[rows])
+
+
+def _nearest(search: _Search) -> IkResult:
+    """One solution a pose, near the reference."""
+    robot, poses, reference = search[:3]
+    match search.method:
+        case "all":
+            return _from_all(search)
+        case "pseudo_inverse":
+            return solve_by_descent(robot, poses, reference, search.key, search.starts)
+        case _:
+            return from_table(robot, poses, reference, search.weights)
+
+
+def _from_all(search: _Search) -> IkResult:
     """The nearest of all solutions; descents where there is none, or a continuum of them."""
-    every = jax.tree.map(np.asarray, all_ik(robot, poses))
-    solved = every.mask.any(axis=-1)
-    away = np.sum((bending_of(every.q) - bending_of(reference)[:, None]) ** 2, axis=-1)
-    parts = None if world is None else _parts(robot, every, world)
-    if parts is not None:
-        depth = np.minimum(parts.min(axis=-1), 0.0)
-        # Any clear solution ranks before any that collides, and those by their depth.
-        away = np.where(depth < 0, 1e6 - 1e6 * depth, away)
-    # One more column, so that there is something to take where no pose has a solution.
-    away = np.pad(np.where(every.mask, away, np.inf), ((0, 0), (0, 1)), constant_values=np.inf)
-    choice, rows = np.argmin(away, axis=1), np.arange(len(poses))
-    nearest = away[rows, choice]
-
-    def taken(values: np.ndarray) -> np.ndarray:
-        wide = np.pad(values, ((0, 0), (0, 1)) + ((0, 0),) * (values.ndim - 2))
-        return wide[rows, choice]
-
-    q, position, angle = map(taken, (every.q, every.position_error, every.orientation_error))
-    q = np.where(solved[:, None], q, 0.0)
-    result = closest(robot, poses, q, position, angle, solved)
-    if parts is not None:
-        found = np.where(solved[:, None], taken(parts), np.nan)
-        return _with_clearance(result, found, solved)
-    open_rows = np.flatnonzero(~solved | ~every.complete)
+    robot, poses, reference = search[:3]
+    every = all_ik(robot, poses)
+    chosen = choose(robot, of_all(every), reference, {"distance": 1.0}, None)
+    result = _result(search, chosen)
+    open_rows = np.flatnonzero(~chosen.solved | ~np.asarray(every.complete))
     if not len(open_rows):
         return result
-    other = jax.tree.map(
-        np.asarray, solve_by_descent(robot, poses[open_rows], reference[open_rows], key, starts)
+    other = solve_by_descent(
+        robot, poses[open_rows], reference[open_rows], search.key, search.starts
     )
+    other = jax.tree.map(np.asarray, other)
     distance = np.sum((bending_of(other.q) - bending_of(reference[open_rows])) ** 2, axis=-1)
-    better = ~solved[open_rows] | (other.converged & (distance < nearest[open_rows]))
+    better = ~chosen.solved[open_rows] | (other.converged & (distance < chosen.cost[open_rows]))
     for kept, new in zip(jax.tree.leaves(result), jax.tree.leaves(other), strict=True):
         kept[open_rows[better]] = new[better]
     return result
 
 
-@jax.jit
-def _part_clearances(robot: Robot, q: Float[Array, "n dof"], world: World) -> Float[Array, "n p"]:
-    return part_clearances(robot, q, world)
+def _best(search: _Search, prefer: Mapping[str, float], world: World | None) -> IkResult:
+    """The best of several solutions; where none is found, the closest to the pose."""
+    robot, poses, reference, weights = search[:4]
+    found, free = _several(search)
+    chosen = _copied(choose(robot, found, reference, prefer, world))
+    if world is not None:
+        enough = np.inf if "clearance" in prefer else 0.0
+        rows = np.flatnonzero(chosen.solved & free & ~(chosen.clearance >= enough))
+        if len(rows):
+            part = Candidates(*(x[rows] for x in found))
+            moved = climb(robot, poses[rows], weights, part, world, enough)
+            again = choose(robot, moved, reference[rows], prefer, world)
+            better = again.cost < chosen.cost[rows]
+            for kept, new in zip(chosen, again, strict=True):
+                kept[rows[better]] = new[better]
+    result = _result(search, chosen)
+    open_rows = np.flatnonzero(~chosen.solved)
+    if len(open_rows):
+        other = jax.tree.map(np.asarray, _nearest(search.only(open_rows)))
+        for kept, new in zip(jax.tree.leaves(result), jax.tree.leaves(other), strict=True):
+            kept[open_rows] = new
+        late = open_rows[other.converged]
+        if len(late):  # the search for one solution is more thorough than that for several
+            errors = (result.position_error, result.orientation_error)
+            alone = Candidates(
+                *(np.asarray(x)[late, None] for x in (result.q, result.converged, *errors))
+            )
+            for kept, new in zip(
+                chosen, choose(robot, alone, reference[late], prefer, world), strict=True
+            ):
+                kept[late] = new
+    return result if world is None else _with_clearance(result, chosen)
 
 
-def _parts(robot: Robot, every: AllIkResult, world: World) -> Float[np.ndarray, "rows K parts"]:
-    """Signed distance of every capsule in every solution [m]; NaN where there is none."""
-    mask = np.asarray(every.mask)
-    q = np.asarray(every.q)[mask]
-    found = np.full((*mask.shape, CAPSULES * robot.n_segments), np.nan)
-    if len(q):
-        with jax.enable_x64(True):
-            found[mask] = np.asarray(_part_clearances(robot, pad_rows(q), world))[: len(q)]
-    return found
+def _several(search: _Search) -> tuple[Candidates, np.ndarray]:
+    """Solutions of each pose, and whether they have freedom to move."""
+    robot, poses, reference, weights = search[:4]
+    free = 2 * robot.n_segments > int((weights > 0).sum())
+    if robot.n_segments > MOST_SEGMENTS:
+        found = of_descents(robot, poses, reference, search.key, search.starts)
+        return found, np.zeros(len(poses), bool)
+    every = all_ik(robot, poses, weights=weights)
+    return of_all(every), free | (is_exhaustive(robot) & ~np.asarray(every.complete))
 
 
-def _with_clearance(
-    result: IkResult, parts: Float[np.ndarray, "rows parts"], solved: np.ndarray
-) -> IkResult:
+def _copied(chosen: Chosen) -> Chosen:
+    return Chosen(*(np.array(x) for x in chosen))
+
+
+def _result(search: _Search, chosen: Chosen) -> IkResult:
+    return closest(
+        search.robot, search.poses, chosen.q, chosen.position, chosen.angle, chosen.solved
+    )
+
+
+def _with_clearance(result: IkResult, chosen: Chosen) -> IkResult:
     """What is known of the chosen solutions' distances; those that collide are BLOCKED."""
-    least = parts.min(axis=-1)
-    blocked = solved & (least < 0)
-    # The first capsule stands in the mount and is left out; the last one is the tool's.
-    place = np.where(solved, np.argmin(parts, axis=-1) + 1, 0)
+    blocked = chosen.solved & (chosen.clearance < 0)
     return eqx.tree_at(
-        lambda r: (r.converged, r.status, r.clearance, r.nearest_segment),
+        lambda r: (r.converged, r.status, r.clearance, r.nearest_segment, r.nearest_point),
         result,
         (
-            solved & ~blocked,
+            chosen.solved & ~blocked,
             np.where(blocked, int(IkStatus.BLOCKED), result.status),
-            least,
-            np.where(solved, place // CAPSULES + 1, 0),
+            chosen.clearance,
+            np.where(chosen.solved, np.nan_to_num(chosen.part), 0).astype(int),
+            chosen.point,
         ),
         is_leaf=lambda x: x is None,
     )

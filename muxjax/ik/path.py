@@ -33,6 +33,7 @@ def solve_path(
     *,
     q0: Float[Array, " dof"] | None = None,
     largest_step: float = SWITCH,
+    project_rotations: bool = False,
 ) -> PathResult:
     """Configurations for poses in order, each near the one before.
 
@@ -46,11 +47,12 @@ def solve_path(
         poses: In order; checked as by ``solve_ik``.
         q0: Configuration before the first pose [rad]; the straight arm by default.
         largest_step: Change of a segment's bending [rad] above which a step is a switch.
+        project_rotations: As for ``all_ik``.
 
     Raises:
         ValueError: Poses that cannot be meant, not a sequence of them, or q0 beyond the limits.
     """
-    checked = check_pose(robot, poses)
+    checked = check_pose(robot, poses, project_rotations)
     if checked.ndim != 3:
         raise ValueError(f"poses: must have shape (N, 4, 4), found {checked.shape}")
     if largest_step <= 0:

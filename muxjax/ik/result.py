@@ -42,6 +42,7 @@ class IkResult(eqx.Module):
     # With a world: least signed distance to obstacles and to the arm itself [m], negative = depth
     clearance: Float[Array, "*batch"] | None = None
     nearest_segment: Int[Array, "*batch"] | None = None  # where that is, 1 to S; S + 1 is the tool
+    nearest_point: Float[Array, "*batch 3"] | None = None  # on the arm's axis there [m]
 
     def check(self) -> IkResult:
         """This result, if every pose was reached.

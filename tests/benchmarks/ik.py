@@ -1,24 +1,28 @@
 """Inverse kinematics side by side: `python -m tests.benchmarks.ik [--targets 2000]`.
 
 Random reachable targets of MuxArm, bending uniform within the limits, one seed. Ours in its
-methods, beside scipy's least squares from one random start, and optimistix where the environment
-that runs this has it. Figures are CPU time over all threads, and wall time for one target.
+methods, beside scipy and optimistix from one random start in an environment of their own
+(``ik_peers_runner``). Figures are CPU time over all threads; the seconds of first calls are wall.
 """
 
 from __future__ import annotations
 
 import argparse
-import importlib.util
-import time
+import json
+import subprocess
+import sys
+import tempfile
 from collections.abc import Callable
+from pathlib import Path
 
+import jax
 import numpy as np
-from scipy.optimize import least_squares
+import scipy
 
 import muxjax
 from muxjax.ik import all_ik, solve_ik
 from muxjax.robot import Robot
-from tests.benchmarks.common import machine, rounds, spread, table
+from tests.benchmarks.common import fresh_process, machine, rounds, spread, table
 
 SEED = 20260418
 BATCH = 1000
@@ -33,28 +37,48 @@ def targets(robot: Robot, n: int) -> np.ndarray:
     return muxjax.forward_kinematics(robot, np.stack([theta, phi], axis=-1).reshape(n, -1))
 
 
-def by_scipy(robot: Robot, poses: np.ndarray) -> float:
-    """Share solved at 1e-9 from one random start each."""
-    rng = np.random.default_rng(SEED)
-    solved = 0
-    for pose in poses:
+def peers(robot: Robot, poses: np.ndarray, n_rounds: int) -> dict | str:
+    """Figures of scipy and optimistix from an environment of their own, or why there are none."""
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        starts = np.random.default_rng(SEED).normal(size=(len(poses), 2 * robot.n_segments))
+        np.savez(folder / "given.npz", lengths=robot.length, poses=poses, starts=starts)
+        python = folder / "peers" / "bin" / "python"
+        packages = ["optimistix==0.1.0", f"scipy=={scipy.__version__}", f"jax=={jax.__version__}"]
+        try:
+            subprocess.run([sys.executable, "-m", "venv", folder / "peers"], check=True)
+            subprocess.run([python, "-m", "pip", "install", "--quiet", *packages], check=True)
+            script = Path(__file__).with_name("ik_peers_runner.py")
+            command = [python, script, folder / "given.npz", str(n_rounds)]
+            done = subprocess.run(command, check=True, capture_output=True, text=True)
+        except (OSError, subprocess.CalledProcessError) as error:
+            return f"not measured: {str(getattr(error, 'stderr', None) or error).strip()[-200:]}"
+        return json.loads(done.stdout.splitlines()[-1])
 
-        def error(b: np.ndarray, pose: np.ndarray = pose) -> np.ndarray:
-            bx, by = b[0::2], b[1::2]
-            q = np.stack([np.hypot(bx, by), np.arctan2(by, bx)], axis=-1).ravel()
-            found = muxjax.forward_kinematics(robot, q)
-            return ((found - pose)[:3] * [1, 1, 1, 1 / 0.47]).ravel()
 
-        found = least_squares(error, rng.normal(size=6), xtol=1e-15, ftol=1e-15, gtol=1e-15)
-        solved += np.abs(found.fun).max() < 1e-9
-    return solved / len(poses)
-
-
-def first_call(robot: Robot, pose: np.ndarray) -> float:
-    """Seconds of the first call of a process, compilation included."""
-    start = time.perf_counter()
-    all_ik(robot, pose)
-    return time.perf_counter() - start
+def first_calls() -> list[list[str]]:
+    """Seconds of the first call in a fresh process: without and with a filled persistent cache."""
+    rows = []
+    for label, robot, call in (
+        ("all_ik, muxarm, one pose", "muxarm", "all_ik(robot, pose[0])"),
+        ("all_ik, muxarm, 1000 poses", "muxarm", "all_ik(robot, pose)"),
+        ("one solution, muxarm", "muxarm", "solve_ik(robot, pose, method='levenberg_marquardt')"),
+        ("one solution, penta", "penta", "solve_ik(robot, pose)"),
+    ):
+        code = (
+            "import time, numpy as np, muxjax\nfrom muxjax.ik import all_ik, solve_ik\n"
+            f"robot = muxjax.load_robot('{robot}')\n"
+            "rng = np.random.default_rng(0)\n"
+            "q = rng.uniform(0, robot.theta_max.min(), (1000, 2 * robot.n_segments))\n"
+            "pose = muxjax.forward_kinematics(robot, q)\nstart = time.perf_counter()\n"
+            f"{call}\nprint(time.perf_counter() - start)"
+        )
+        with tempfile.TemporaryDirectory() as cache:
+            bare, _, cached = (
+                fresh_process(code, folder) for folder in (None, Path(cache), Path(cache))
+            )
+        rows.append([label, f"{bare:.1f}", f"{cached:.1f}"])
+    return rows
 
 
 def main() -> None:
@@ -65,7 +89,6 @@ def main() -> None:
     options = parser.parse_args()
     robot = muxjax.load_robot("muxarm")
     poses = targets(robot, options.targets)
-    compile_time = first_call(robot, poses[0])
     batches = [poses[i : i + BATCH] for i in range(0, len(poses), BATCH)]
     contestants: dict[str, tuple[Callable[[], object], int, Callable[[], float]]] = {
         "all solutions, batches of 1000": (
@@ -89,11 +112,6 @@ def main() -> None:
                 np.mean(solve_ik(robot, poses[:BATCH], method=method).converged)
             ),
         )
-    contestants["scipy least_squares, one start"] = (
-        lambda: by_scipy(robot, poses[:FEW]),
-        FEW,
-        lambda: by_scipy(robot, poses[:FEW]),
-    )
     times = rounds({name: call for name, (call, _, _) in contestants.items()}, options.rounds)
     rows = []
     for name, (_, count, success) in contestants.items():
@@ -106,10 +124,22 @@ def main() -> None:
                 f"{100 * success():.2f}",
             ]
         )
-    print(f"{machine()}\nfirst call of all_ik for one pose: {compile_time:.1f} s\n")
-    print(table(["", "CPU us a target", "targets / core-s", "solved [%]"], rows))
-    if importlib.util.find_spec("optimistix") is None:
-        print("\noptimistix: not installed here, left out")
+    found = peers(robot, poses[:FEW], max(3, options.rounds // 2))
+    notes = ["micsolver (C++) is on no package index and is not measured here"]
+    if isinstance(found, str):
+        notes.append(f"scipy, optimistix: {found}")
+    else:
+        for name, peer in found.items():
+            middle, low, high = (1e6 * x for x in spread(peer["times"]))
+            label = f"{name} {peer['version']}, Levenberg-Marquardt or trust region, one start"
+            shown = f"{middle:.1f} ({low:.1f}-{high:.1f})"
+            rows.append([label, shown, f"{1e6 / middle:.0f}", f"{100 * peer['solved']:.2f}"])
+    print(f"{machine()}; seed {SEED}\n")
+    print(
+        table(["", "CPU us a target, median (quartiles)", "targets / core-s", "solved [%]"], rows)
+    )
+    header = ["first call in a fresh process", "wall s", "with the persistent cache"]
+    print("\n" + table(header, first_calls()) + "\n\n" + "\n".join(notes))
 
 
 if __name__ == "__main__":

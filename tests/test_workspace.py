@@ -11,18 +11,23 @@ import time
 from fractions import Fraction
 from pathlib import Path
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import muxjax
 from muxjax import workspace
+from muxjax.collision import clearance, load_world
 from muxjax.config import FrameConfig
 from muxjax.robot import Robot, robot_from_config
-from muxjax.workspace import orientation, sampling
+from muxjax.workspace import marking, orientation, sampling
+from muxjax.workspace.about import about_sweep, identity_of
 from muxjax.workspace.cells import Cells, cells_for, inverse_root
+from muxjax.workspace.checkpoint import State, save_checkpoint
 from muxjax.workspace.convergence import extrapolate
 from muxjax.workspace.files import write_file
+from muxjax.workspace.marking import Layout
 
 SMALL: dict = {"cells": (6, 12), "bins_per_axis": 16, "progress": False}
 TABLES = ("counts", "met", "met_bounds", "met_tests", "ladder_samples", "ladder_met")
@@ -574,3 +579,63 @@ def test_pictures(muxarm: Robot, tmp_path: Path) -> None:
         path = draw_it(what, tmp_path / f"{draw_it.__name__}.png")
         assert path.read_bytes().startswith(b"\x89PNG")
         assert path.stat().st_size > 10_000
+
+
+def test_a_sweep_in_a_world_counts_what_is_clear(muxarm: Robot, tmp_path: Path) -> None:
+    """Against clearances of the same samples in float64; resumed, saved and drawn."""
+    pytest.importorskip("matplotlib")
+    from muxjax.workspace import plots
+
+    world, other = load_world("cabinet"), load_world("s_pipe")
+    options: dict = {**SMALL, "bins_per_axis": 8, "sectors": 4, "sampler": "lattice"}
+    checkpoint = tmp_path / "part.npz"
+    part = workspace.sweep(
+        muxarm, samples=sampling.BLOCK, world=world, checkpoint=checkpoint, **options
+    )
+    assert part.clear_counts is not None
+    assert part.counts.sum() == sampling.BLOCK
+    assert (part.clear_counts <= part.counts).all()
+    assert (part.met[part.clear_counts == 0] == 0).all()
+    rows, columns = sampling.lattice_parts(6, 0, 0)
+    u = np.stack(sampling.lattice_fractions(rows, columns)).reshape(6, -1).T[:2048].astype(float)
+    q = u * np.stack([muxarm.theta_max, np.full(3, 2 * np.pi)], axis=-1).reshape(-1)
+    q[:, 1::2] += np.pi  # turn() is half a turn away from the fraction's own azimuth
+    with jax.enable_x64(True):
+        share = float((np.asarray(clearance(muxarm, jnp.asarray(q), world)) >= 0).mean())
+    assert part.clear_counts.sum() / part.counts.sum() == pytest.approx(share, abs=0.03)
+    assert 0 < part.clear_volume < part.reach_volume
+    copy = workspace.load_sweep(part.save(tmp_path / "sweep.npz"))
+    assert np.array_equal(copy.clear_counts, part.clear_counts)
+    np.testing.assert_array_equal(copy.clear_share, part.clear_share)
+    drawn = plots.clear_map(part, world, tmp_path / "clear.png")
+    assert drawn.stat().st_size > 10_000
+
+    layout = Layout((4, 6, 12), 8, orientation.n_bins(8, False), "lattice", True)
+    grid = cells_for(muxarm, (6, 12), 4, True)
+    identity = identity_of(about_sweep(muxarm, layout, 0, 10.0, world), grid)
+    state = State(marking.new_tables(layout), counts=np.zeros(layout.n_counts, np.int64))
+    save_checkpoint(checkpoint, layout, identity, state)
+    again = workspace.sweep(
+        muxarm, samples=sampling.BLOCK, world=world, checkpoint=checkpoint, resume=True, **options
+    )
+    assert same(again, part)
+    assert np.array_equal(again.clear_counts, part.clear_counts)
+    for wrong in (other, None):
+        more = options if wrong is not None else {**options, "sectors": 1}
+        with pytest.raises(workspace.SweepFileError, match="of another sweep"):
+            workspace.sweep(
+                muxarm,
+                samples=sampling.BLOCK,
+                world=wrong,
+                checkpoint=checkpoint,
+                resume=True,
+                **more,
+            )
+
+
+def test_a_sweep_without_a_world_has_no_clear_share(muxarm: Robot) -> None:
+    found = workspace.sweep(muxarm, samples=1000, **SMALL)
+    with pytest.raises(ValueError, match="the sweep had no world"):
+        _ = found.clear_share
+    with pytest.raises(ValueError, match="sectors: must be 1"):
+        workspace.sweep(muxarm, samples=1000, world=load_world("cabinet"), sectors=1, **SMALL)

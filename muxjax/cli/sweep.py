@@ -9,6 +9,7 @@ from typing import Any, Literal
 from rich.table import Table
 
 from muxjax.cli.output import console, print_json
+from muxjax.collision import World, load_world
 from muxjax.robot import load_robot
 from muxjax.workspace import DesignStudy, Sweep, SweepInterruptedError, design_study
 from muxjax.workspace import sweep as run_sweep
@@ -21,17 +22,20 @@ def sweep(
     vary: tuple[str, ...] = (),
     tolerance_deg: float = 10.0,
     robot: str = "muxarm",
+    world: str | None = None,
     out: Path = Path("out/sweep"),
     resume: bool = False,
     json: bool = False,
 ) -> int:
     """Reach and dexterity over all configurations of an arm.
 
-    Writes sweep.npz (everything), dexterity.png, convergence.png and cut.png; with --vary a table
-    designs.csv and designs.png instead. Interrupt it at any time; the same command with --resume
-    goes on from the last checkpoint and comes to the same tables.
+    Writes sweep.npz (everything), dexterity.png, convergence.png and cut.png, and with --world
+    clear.png, where clear samples reach; with --vary a table designs.csv and designs.png instead.
+    Interrupt it at any time; the same command with --resume goes on from the last checkpoint and
+    comes to the same tables.
 
     Example: muxjax sweep --samples 1e9 --out out/muxarm
+    Example: muxjax sweep --world cabinet --samples 3e6
     Example: muxjax sweep --vary "segments[1].length_m=0.12,0.15,0.18" --samples 3e6
 
     Args:
@@ -41,6 +45,7 @@ def sweep(
         vary: Robot parameters and their values, as path=value,value,...; every combination.
         tolerance_deg: Angle within which an orientation counts as met [degrees].
         robot: Shipped robot or path of a YAML file.
+        world: Shipped world or path of a YAML file; only samples clear of it make a cell dexterous.
         out: Folder to write to.
         resume: Go on from this folder's checkpoint.
         json: Print JSON in SI units.
@@ -55,7 +60,10 @@ def sweep(
         "sampler": sampler,
         "tolerance_deg": tolerance_deg,
     }
+    obstacles = None if world is None else load_world(world)
     if vary:
+        if world is not None:
+            raise ValueError("--world: a design study (--vary) has none")
         if resume:
             raise ValueError("--resume: a design study (--vary) keeps no checkpoint")
         study = design_study(arm, _parameters(vary), **options)
@@ -63,13 +71,18 @@ def sweep(
     checkpoint = out / "checkpoint.npz"
     try:
         found = run_sweep(
-            arm, **options, out=out / "sweep.npz", checkpoint=checkpoint, resume=resume
+            arm,
+            **options,
+            world=obstacles,
+            out=out / "sweep.npz",
+            checkpoint=checkpoint,
+            resume=resume,
         )
     except SweepInterruptedError as interruption:
         print(f"muxjax: {interruption}; --resume goes on", file=sys.stderr)
         return 130
     checkpoint.unlink(missing_ok=True)
-    return _report_sweep(found, out, json)
+    return _report_sweep(found, obstacles, out, json)
 
 
 def _parameters(vary: tuple[str, ...]) -> dict[str, list[float]]:
@@ -85,7 +98,7 @@ def _parameters(vary: tuple[str, ...]) -> dict[str, list[float]]:
     return parameters
 
 
-def _report_sweep(found: Sweep, out: Path, json: bool) -> int:
+def _report_sweep(found: Sweep, world: World | None, out: Path, json: bool) -> int:
     limit = found.limit()
     if json:
         print_json(
@@ -98,11 +111,14 @@ def _report_sweep(found: Sweep, out: Path, json: bool) -> int:
                 "limit_uncertainty": limit.uncertainty,
                 "peak_dexterity": found.peak_dexterity,
             }
+            | ({} if world is None else {"clear_volume_m3": found.clear_volume})
         )
     else:
         table = Table("", f"{found.samples:.3g} samples")
         table.add_row("reach, radius [mm]", f"{1e3 * found.reach_radius:.1f}")
         table.add_row("reach, volume [dm3]", f"{1e3 * found.reach_volume:.2f}")
+        if world is not None:
+            table.add_row("  by clear samples [dm3]", f"{1e3 * found.clear_volume:.2f}")
         table.add_row("mean dexterity", f"{found.mean_dexterity:.4f}")
         table.add_row("  extrapolated limit", f"{limit.value:.4f} +- {limit.uncertainty:.4f}")
         table.add_row("peak dexterity", f"{found.peak_dexterity:.4f}")
@@ -110,6 +126,8 @@ def _report_sweep(found: Sweep, out: Path, json: bool) -> int:
     plots = _plots()
     if plots is not None:
         plots.dexterity_map(found, out / "dexterity.png")
+        if world is not None:
+            plots.clear_map(found, world, out / "clear.png")
         plots.convergence_curve(found, out / "convergence.png")
         plots.workspace_cut(found, out / "cut.png")
     if not json:

@@ -11,14 +11,17 @@ from typing import Any
 import jax
 import numpy as np
 
+from muxjax.collision import World
 from muxjax.robot import Robot
 from muxjax.workspace.cells import Cells
 from muxjax.workspace.marking import Layout
 from muxjax.workspace.orientation import bin_error
 
 
-def about_sweep(robot: Robot, layout: Layout, seed: int, tolerance_deg: float) -> dict[str, Any]:
-    """Robot, grids, seed and versions, as JSON can hold them."""
+def about_sweep(
+    robot: Robot, layout: Layout, seed: int, tolerance_deg: float, world: World | None = None
+) -> dict[str, Any]:
+    """Robot, world, grids, seed and versions, as JSON can hold them."""
     error = bin_error(layout.per_axis, layout.in_plane)
     return {
         "robot": {
@@ -28,7 +31,17 @@ def about_sweep(robot: Robot, layout: Layout, seed: int, tolerance_deg: float) -
             "theta_max_rad": np.asarray(robot.theta_max, float).tolist(),
             "base": np.asarray(robot.base, float).tolist(),
             "tool": np.asarray(robot.tool, float).tolist(),
-        },
+        }
+        | (
+            {}
+            if world is None
+            else {"body_radius_m": float(robot.body_radius)}  # decides what is clear
+        ),
+        **(
+            {}
+            if world is None
+            else {"world": {"name": world.name, "fingerprint": world.fingerprint}}
+        ),
         "axially_symmetric": layout.in_plane,
         "seed": int(seed),
         "sampler": layout.sampler,

@@ -79,26 +79,29 @@ class Cells:
         return np.broadcast_to((ring[:, None] * np.diff(self.z_edges))[None], self.shape)
 
 
-def cells_for(robot: Robot, shape: tuple[int, int] | None, sectors: int | None) -> Cells:
+def cells_for(
+    robot: Robot, shape: tuple[int, int] | None, sectors: int | None, in_world: bool = False
+) -> Cells:
     """Cells that hold every pose of a robot.
 
     Args:
         robot: The arm.
         shape: (radii, heights); default (48, 96), or (16, 32) where azimuth counts too.
         sectors: Azimuth sectors; default 1 for an axially symmetric arm, 12 for another.
+        in_world: Among obstacles, which make every arm unsymmetric.
 
     Raises:
         ValueError: A count below 1, or one sector for an arm that is not symmetric.
     """
-    symmetric = axially_symmetric(robot)
+    symmetric = not in_world and axially_symmetric(robot)
     n_r, n_z = shape or ((48, 96) if symmetric else (16, 32))
     n_sectors = sectors or (1 if symmetric else 12)
     if min(n_r, n_z, n_sectors) < 1:
         raise ValueError(f"cells: counts must be at least 1, found {(n_r, n_z)}, {n_sectors}")
     if symmetric != (n_sectors == 1):
         raise ValueError(
-            f"sectors: must be 1 for an axially symmetric arm and more for another; {n_sectors} "
-            f"found, and this arm is {'' if symmetric else 'not '}symmetric"
+            "sectors: must be 1 for an axially symmetric arm without obstacles, more for another; "
+            f"{n_sectors} found, and this arm is {'' if symmetric else 'not '}symmetric"
         )
     tool = np.asarray(robot.tool)[:3, 3]
     reach = float(np.sum(robot.length) + np.linalg.norm(tool))

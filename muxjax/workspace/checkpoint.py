@@ -30,11 +30,11 @@ class State:
 def start(layout: Layout, identity: str, path: Path | None, samples: int) -> State:
     """A fresh state, or that of a checkpoint if there is one."""
     if path is None or not path.exists():
-        return State(marking.new_tables(layout), counts=np.zeros(layout.n_cells, np.int64))
+        return State(marking.new_tables(layout), counts=np.zeros(layout.n_counts, np.int64))
     header, arrays = read_file(path, CHECKPOINT_SCHEMA)
     if header["identity"] != identity:
         raise SweepFileError(
-            f"{path}: is of another sweep (robot, seed, sampler, cells or bins differ)"
+            f"{path}: is of another sweep (robot, world, seed, sampler, cells or bins differ)"
         )
     blocks = header["blocks"]
     if blocks > -(-samples // BLOCK) or (blocks * BLOCK > samples):

@@ -16,6 +16,7 @@ import numpy as np
 from jax.experimental import multihost_utils
 
 from muxjax.batched import chain
+from muxjax.collision import World
 from muxjax.robot import Robot
 from muxjax.workspace import marking
 from muxjax.workspace.about import about_sweep, identity_of
@@ -46,6 +47,7 @@ def sweep(
     sectors: int | None = None,
     tolerance_deg: float = 10.0,
     bins_per_axis: int | None = None,
+    world: World | None = None,
     out: str | Path | None = None,
     checkpoint: str | Path | None = None,
     resume: bool = False,
@@ -71,6 +73,9 @@ def sweep(
         tolerance_deg: Angle within which an orientation counts as met, 1 to 60 degrees.
         bins_per_axis: Fineness of the orientation bins, even; default 32 (typical error 2.5
             degrees), or 20 (4.0 degrees) where azimuth sectors need the memory.
+        world: Obstacles. Every sample is then checked for clearance: all are counted, but only
+            the clear ones make a cell dexterous. A world is not axially symmetric, so cells have
+            azimuth sectors.
         out: File for the result, .npz.
         checkpoint: File to save progress in; also on Ctrl-C.
         resume: Go on from ``checkpoint`` if it exists.
@@ -82,12 +87,12 @@ def sweep(
         SweepFileError: ``checkpoint`` is damaged, or of another sweep.
         SweepInterruptedError: Ctrl-C.
     """
-    grid = cells_for(robot, cells, sectors)
+    grid = cells_for(robot, cells, sectors, world is not None)
     symmetric = grid.n_sectors == 1
     per_axis = bins_per_axis or (32 if symmetric else 20)
-    layout = Layout(grid.shape, per_axis, n_bins(per_axis, symmetric), sampler)
+    layout = Layout(grid.shape, per_axis, n_bins(per_axis, symmetric), sampler, world is not None)
     _check_arguments(layout, samples, seed, tolerance_deg, checkpoint, resume, out)
-    about = about_sweep(robot, layout, seed, tolerance_deg)
+    about = about_sweep(robot, layout, seed, tolerance_deg, world)
     identity = identity_of(about, grid)
     path = Path(checkpoint) if checkpoint is not None else None
     state = start(layout, identity, path if resume else None, samples)
@@ -95,6 +100,7 @@ def sweep(
         jax.tree.map(jnp.asarray, chain(robot)),
         jnp.asarray(robot.theta_max, jnp.float32),
         jnp.asarray(grid.reach, jnp.float32),
+        None if world is None else jax.tree.map(_float32, (robot, world)),
     )
     tolerance = np.radians(tolerance_deg)
     widest = tolerance + bin_error(per_axis, symmetric).typical
@@ -114,6 +120,10 @@ def sweep(
     if out is not None and jax.process_index() == 0:
         result.save(out)
     return result
+
+
+def _float32(leaf: np.ndarray) -> jax.Array:
+    return jnp.asarray(leaf, jnp.float32)
 
 
 def _check_arguments(
@@ -256,7 +266,10 @@ def _finish(
         about=about,
         cells=grid,
         samples=samples,
-        counts=state.counts.reshape(grid.shape),
+        counts=state.counts[: layout.n_cells].reshape(grid.shape),
+        clear_counts=(
+            state.counts[layout.n_cells :].reshape(grid.shape) if layout.in_world else None
+        ),
         met=final.reshape(grid.shape),
         met_bounds=np.array(bounds).reshape(2, *grid.shape),
         met_tests=tests,

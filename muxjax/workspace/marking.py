@@ -15,9 +15,11 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
-from jaxtyping import Int32, UInt8, UInt32
+from jaxtyping import Bool, Int32, UInt8, UInt32
 
-from muxjax.batched import WIDE_VECTORS, Chain
+from muxjax.batched import WIDE_VECTORS, Chain, Vector
+from muxjax.collision import World, bending_clearance
+from muxjax.robot import Robot
 from muxjax.workspace.cells import slot_index
 from muxjax.workspace.sampling import (
     BLOCK,
@@ -38,7 +40,8 @@ class Tables(NamedTuple):
     """Marks and counts of each device."""
 
     marks: UInt8[jax.Array, "D B*C"]  # bin * cells + cell: 1 if some sample fell there
-    counts: Int32[jax.Array, "D C"]  # samples in each cell since the last flush
+    # Samples in each cell since the last flush; in a world, followed by those that were clear.
+    counts: Int32[jax.Array, "D K"]
 
 
 class Layout(NamedTuple):
@@ -48,6 +51,12 @@ class Layout(NamedTuple):
     per_axis: int  # orientation bins
     n_bins: int
     sampler: Sampler
+    in_world: bool = False  # only clear samples leave marks; all are counted
+
+    @property
+    def n_counts(self) -> int:
+        """Of all samples, and of the clear ones if there is a world."""
+        return self.n_cells * (1 + self.in_world)
 
     @property
     def n_cells(self) -> int:
@@ -66,6 +75,7 @@ class Scale(NamedTuple):
     arm: Chain
     theta_max: jax.Array
     reach: jax.Array
+    arena: tuple[Robot, World] | None = None  # for the clearance of samples
 
 
 @lru_cache(maxsize=1)
@@ -95,9 +105,9 @@ def new_tables(layout: Layout, marks: np.ndarray | None = None) -> Tables:
 def _zero_counts(layout: Layout) -> jax.Array:
     mesh = all_devices()
     return jax.make_array_from_callback(
-        (mesh.size, layout.n_cells),
+        (mesh.size, layout.n_counts),
         NamedSharding(mesh, PartitionSpec(_AXIS)),
-        lambda index: np.zeros((1, layout.n_cells), np.int32),
+        lambda index: np.zeros((1, layout.n_counts), np.int32),
     )
 
 
@@ -120,29 +130,34 @@ def visit_round(
         sharding = NamedSharding(mesh, PartitionSpec(_AXIS))
         own = jax.make_array_from_callback(rows.shape, sharding, lambda index: rows[index])
         draws = (own, parts[0][1])
-    slots, mark = _compiled_round(layout, dimensions, mesh)
-    return mark(tables, slots(scale, limits, draws), limits)
+    slots, clear, mark = _compiled_round(layout, dimensions, mesh)
+    seen = clear(scale, limits, draws) if layout.in_world else None
+    return mark(tables, slots(scale._replace(arena=None), limits, draws), seen, limits)
 
 
 @lru_cache(maxsize=16)
-def _compiled_round(layout: Layout, dimensions: int, mesh: Mesh) -> tuple[Any, Any]:
-    """Samples to slots, and slots to marks.
+def _compiled_round(layout: Layout, dimensions: int, mesh: Mesh) -> tuple[Any, Any, Any]:
+    """Samples to slots, samples to whether they are clear, and both to marks.
 
-    They are two programs because XLA would otherwise compute the samples again inside the
+    They are several programs because XLA would otherwise compute the samples again inside the
     scatters, one by one, at ten times the cost.
     """
     split, same = PartitionSpec(_AXIS), PartitionSpec()
-    slots = jax.shard_map(
-        partial(_block_slots, layout, dimensions),
-        mesh=mesh,
-        in_specs=(same, same, (same,) if layout.sampler == "random" else (split, same)),
-        out_specs=split,
+    slots, clear = (
+        jax.shard_map(
+            partial(block, layout, dimensions),
+            mesh=mesh,
+            in_specs=(same, same, (same,) if layout.sampler == "random" else (split, same)),
+            out_specs=split,
+        )
+        for block in (_block_slots, _block_clear)
     )
     mark = jax.shard_map(
-        partial(_mark, layout), mesh=mesh, in_specs=(split, split, same), out_specs=split
+        partial(_mark, layout), mesh=mesh, in_specs=(split, split, split, same), out_specs=split
     )
     return (
         jax.jit(slots, compiler_options=WIDE_VECTORS),
+        jax.jit(clear),
         jax.jit(mark, donate_argnums=0),
     )
 
@@ -167,6 +182,34 @@ def _block_slots(
     draws: tuple[jax.Array, ...],
 ) -> Int32[jax.Array, "1 R C"]:
     """Slots of one device's block, all its lanes."""
+    u = _block_bending(layout, dimensions, scale, limits, draws)
+    slots = slot_index(scale.arm, u, scale.reach, layout.shape, layout.per_axis)
+    # Not flattened here: a one-dimensional loop over outer sums is not vectorised.
+    return slots[None]
+
+
+def _block_clear(
+    layout: Layout,
+    dimensions: int,
+    scale: Scale,
+    limits: UInt32[jax.Array, " 3"],
+    draws: tuple[jax.Array, ...],
+) -> Bool[jax.Array, "1 R C"]:
+    """Whether each lane of one device's block is clear of the world and of itself."""
+    assert scale.arena is not None
+    robot, world = scale.arena
+    u = jnp.stack(_block_bending(layout, dimensions, scale, limits, draws), axis=-1)
+    return jnp.asarray(bending_clearance(robot, u.reshape(*u.shape[:-1], -1, 2), world) >= 0)[None]
+
+
+def _block_bending(
+    layout: Layout,
+    dimensions: int,
+    scale: Scale,
+    limits: UInt32[jax.Array, " 3"],
+    draws: tuple[jax.Array, ...],
+) -> Vector:
+    """Bending of one device's block."""
     block, _ = _assignment(limits)
     lane = lax.broadcasted_iota(jnp.uint32, (ROWS, COLUMNS), 0) * np.uint32(COLUMNS)
     lane = lane + lax.broadcasted_iota(jnp.uint32, (ROWS, COLUMNS), 1)
@@ -174,16 +217,14 @@ def _block_slots(
         fractions = random_fractions(draws[0], block, lane, dimensions)
     else:
         fractions = lattice_fractions(draws[0][0], draws[1])
-    u = bending_of(scale.arm, scale.theta_max, fractions, layout.in_plane)
-    slots = slot_index(scale.arm, u, scale.reach, layout.shape, layout.per_axis)
-    # Not flattened here: a one-dimensional loop over outer sums is not vectorised.
-    return slots[None]
+    return bending_of(scale.arm, scale.theta_max, fractions, layout.in_plane)
 
 
 def _mark(
     layout: Layout,
     tables: Tables,
     slots: Int32[jax.Array, "1 R C"],
+    clear: Bool[jax.Array, "1 R C"] | None,
     limits: UInt32[jax.Array, " 3"],
 ) -> Tables:
     """Set the marks of one device's block and count its wanted samples.
@@ -193,11 +234,15 @@ def _mark(
     _, valid = _assignment(limits)
     wanted = lax.iota(jnp.uint32, BLOCK) < valid
     slot = jnp.where(wanted, slots.reshape(BLOCK), slots[0, 0, 0])
+    cell = slot % layout.n_cells
+    counts = tables.counts.at[0, cell].add(wanted.astype(jnp.int32), mode="promise_in_bounds")
+    if clear is None:
+        marks = tables.marks.at[0, slot].set(np.uint8(1), mode="promise_in_bounds")
+        return Tables(marks, counts)
+    free = wanted & clear.reshape(BLOCK)
     return Tables(
-        tables.marks.at[0, slot].set(np.uint8(1), mode="promise_in_bounds"),
-        tables.counts.at[0, slot % layout.n_cells].add(
-            wanted.astype(jnp.int32), mode="promise_in_bounds"
-        ),
+        tables.marks.at[0, slot].max(free.astype(jnp.uint8), mode="promise_in_bounds"),
+        counts.at[0, layout.n_cells + cell].add(free.astype(jnp.int32), mode="promise_in_bounds"),
     )
 
 
@@ -212,7 +257,7 @@ def flush_counts(layout: Layout, tables: Tables) -> tuple[Tables, np.ndarray]:
     """Counts of all devices since the last flush as int64, and tables that count from zero."""
     total = _summed()(tables.counts) if all_devices().size > 1 else tables.counts
     # Many devices' sums would leave int32, so they are gathered, not added, on the device.
-    counts = np.asarray(total.addressable_data(0), np.int64).reshape(-1, layout.n_cells)
+    counts = np.asarray(total.addressable_data(0), np.int64).reshape(-1, layout.n_counts)
     return Tables(tables.marks, _zero_counts(layout)), counts.sum(axis=0)
 
 

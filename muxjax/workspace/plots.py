@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from muxjax.collision import World, point_distance
 from muxjax.workspace.design import DesignStudy
 from muxjax.workspace.result import Sweep
 
@@ -40,6 +41,66 @@ def dexterity_map(sweep: Sweep, path: str | Path) -> Path:
     axes.set_ylabel("z, along the base axis  [mm]")
     axes.set_title(f"{_name(sweep)}: dexterity from {sweep.samples:,} samples", loc="left")
     return _save(figure, path)
+
+
+def clear_map(sweep: Sweep, world: World, path: str | Path) -> Path:
+    """Where clear configurations reach, in the xz and the yz plane, with the obstacles' outline.
+
+    Raises:
+        ValueError: The sweep had no world, or an odd number of sectors.
+    """
+    share, cells = sweep.clear_share, sweep.cells
+    if cells.n_sectors % 4:
+        raise ValueError(f"sectors: must be a multiple of 4 to be drawn, found {cells.n_sectors}")
+    figure, panels = _figure(11.5, 5.2, columns=2)
+    r_mm, quarter = 1e3 * cells.r_edges, cells.n_sectors // 4
+    edges = np.concatenate([-r_mm[:0:-1], r_mm])
+    image = None
+    for axes, first, name in zip(panels, (0, quarter), "xy", strict=True):
+        left = share[first + 2 * quarter]
+        full = np.ma.masked_invalid(np.concatenate([left[::-1], share[first]], axis=0).T)
+        never = np.ma.masked_where(np.ma.getmaskarray(full) | (full.filled(1) > 0), full)
+        image = axes.pcolormesh(
+            edges,
+            1e3 * cells.z_edges,
+            np.ma.masked_where(full.filled(0) == 0, full),
+            cmap=_COLOURS,
+            vmin=0.0,
+            vmax=1.0,
+            rasterized=True,
+        )
+        grey = matplotlib_colours(_MUTED)
+        axes.pcolormesh(edges, 1e3 * cells.z_edges, never, cmap=grey, alpha=0.35, rasterized=True)
+        _outline(axes, sweep, world, name)
+        axes.plot(0, 0, marker="^", color=_ACCENT, markersize=9, linestyle="none")
+        _trim(axes, sweep)
+        axes.set_aspect("equal")
+        axes.set_xlabel(f"{name}, from the arm's root  [mm]")
+        axes.set_ylabel("z, along the base axis  [mm]")
+    bar = figure.colorbar(image, ax=panels, pad=0.02)
+    bar.set_label("share of samples clear of obstacles  [-]; grey: none")
+    title = f"{_name(sweep)} in {world.name}: {sweep.samples:,} samples"
+    figure.suptitle(title, x=0.04, ha="left")
+    return _save(figure, path)
+
+
+def matplotlib_colours(colour: str) -> Any:
+    """A map of one colour."""
+    from matplotlib.colors import ListedColormap
+
+    return ListedColormap([colour])
+
+
+def _outline(axes: Any, sweep: Sweep, world: World, name: str) -> None:
+    """Obstacles' surfaces in the plane of the base's z and x or y axis."""
+    reach = sweep.cells.reach
+    sideways, height = np.meshgrid(np.linspace(-reach, reach, 400), np.linspace(-reach, reach, 400))
+    local = np.zeros((*sideways.shape, 3))
+    local[..., "xy".index(name)], local[..., 2] = sideways, height
+    base = np.asarray(sweep.about["robot"]["base"])
+    away = np.asarray(point_distance(world, local @ base[:3, :3].T + base[:3, 3]))
+    axes.contourf(1e3 * sideways, 1e3 * height, away, levels=[-1e9, 0.0], colors=[_INK], alpha=0.25)
+    axes.contour(1e3 * sideways, 1e3 * height, away, levels=[0.0], colors=[_INK], linewidths=1.2)
 
 
 def convergence_curve(sweep: Sweep, path: str | Path) -> Path:

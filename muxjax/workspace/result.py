@@ -33,11 +33,33 @@ class Sweep:
     met_tests: Int[np.ndarray, "T C8"]  # which ones: a bit for each cell
     ladder_samples: Int[np.ndarray, " K"]  # sample counts at which the sweep was looked at
     ladder_met: Int[np.ndarray, "K A R Z"]
+    # Of a sweep in a world: samples in each cell that were clear. Only they meet orientations.
+    clear_counts: Int[np.ndarray, "A R Z"] | None = None
 
     @property
     def reached(self) -> Bool[np.ndarray, "A R Z"]:
         """Cells that some sample fell into."""
         return self.counts > 0
+
+    @property
+    def clear_share(self) -> Float[np.ndarray, "A R Z"]:
+        """Share of the samples in each cell that are clear of the world, NaN where there are none.
+
+        Raises:
+            ValueError: The sweep had no world.
+        """
+        clear = self._clear()
+        return np.where(self.reached, clear / np.maximum(self.counts, 1), np.nan)
+
+    @property
+    def clear_volume(self) -> float:
+        """Volume of the cells that some clear sample fell into [m^3]."""
+        return float(self.cells.volume[self._clear() > 0].sum())
+
+    def _clear(self) -> Int[np.ndarray, "A R Z"]:
+        if self.clear_counts is None:
+            raise ValueError("clear_counts: the sweep had no world")
+        return self.clear_counts
 
     @property
     def dexterity(self) -> Float[np.ndarray, "A R Z"]:
@@ -114,6 +136,8 @@ class Sweep:
             },
         }
         arrays = {name: getattr(self, name) for name in _ARRAYS}
+        if self.clear_counts is not None:
+            arrays["clear_counts"] = self.clear_counts
         write_file(path, header, arrays, compress=True)
         return path
 
@@ -134,8 +158,8 @@ def load_sweep(path: str | Path) -> Sweep:
         cells = Cells(sizes["radii"], sizes["heights"], sizes["sectors"], sizes["reach_m"])
         samples = header.pop("samples")
         header.pop("schema")
-        return Sweep(
-            about=header, cells=cells, samples=samples, **{name: arrays[name] for name in _ARRAYS}
-        )
+        tables = {name: arrays[name] for name in _ARRAYS}
+        clear = arrays.get("clear_counts")
+        return Sweep(about=header, cells=cells, samples=samples, clear_counts=clear, **tables)
     except KeyError as error:
         raise SweepFileError(f"{path}: {error} is missing") from error

@@ -17,9 +17,9 @@ import muxjax
 from muxjax.planning import METHODS, PlanningError, Problem, plan
 from muxjax.planning.axial import fewest_repositionings
 from muxjax.planning.bounds import AdmissibleBound
-from muxjax.planning.exact import _Table
 from muxjax.planning.lattice import Lattice
-from muxjax.planning.motion import leg_overshoot, leg_time, relative_excess
+from muxjax.planning.motion import leg_time, relative_excess
+from muxjax.planning.table import LatticeTable
 from muxjax.robot import Robot
 
 GOLDEN = Path(__file__).parent / "golden"
@@ -109,8 +109,9 @@ def stage_time(robot, t):
 
 
 def stage_overshoot(robot, t):
-    waiting = robot.switch_time * relative_excess(robot, t.before, t.goal)
-    return waiting + leg_overshoot(robot, t.before, t.after, t.goal)
+    waiting = robot.switch_time * relative_excess(t.theta_before, t.goal)
+    along = relative_excess(t.theta_along, t.goal[..., None, :])
+    return waiting + leg_time(robot, t.after - t.before) * along.mean(axis=-1)
 
 
 def golden_cases():
@@ -143,8 +144,8 @@ def cheapest_by_enumeration(
         usable = np.flatnonzero(reach & (remaining > 0))
         subsets = chain.from_iterable(combinations(usable, n) for n in range(1, len(usable) + 1))
         for chosen in subsets:
-            moves = np.zeros_like(remaining, dtype=bool)
-            moves[list(chosen)] = True
+            moves = np.zeros_like(remaining)
+            moves[list(chosen)] = 1
             both = lattice.costs(remaining[None], moves[None], first=first)[0]
             rest = cheapest_by_enumeration(lattice, remaining - moves, position, first=False)
             costs.append(both[int(position != axial)] + rest)
@@ -162,7 +163,7 @@ def test_exact_equals_enumeration(muxarm, rng, preset, servos):
     assert plan(muxarm, problem).cost == pytest.approx(by_hand, rel=1e-12)
 
 
-@pytest.mark.parametrize("action_set", ["subsets", "all"])
+@pytest.mark.parametrize("action_set", ["subsets", "all", "multistep"])
 @pytest.mark.parametrize("max_step", [None, 0.03])
 def test_bound_is_admissible_at_every_state(muxarm, rng, max_step, action_set):
     presets = ("paper", "fastest", "no-overshoot")
@@ -178,8 +179,7 @@ def test_bound_is_admissible_at_every_state(muxarm, rng, max_step, action_set):
             action_set=action_set,
         )
         lattice = Lattice(muxarm, problem)
-        table = _Table(lattice, 2**30)
-        table.fill()
+        table = LatticeTable(lattice, 2**30)
         remaining = table.remaining(np.arange(len(table.value)))
         bound = AdmissibleBound(lattice)
         for stop in range(len(lattice.reach)):
@@ -385,8 +385,8 @@ def test_unknown_methods_and_options_are_refused(muxarm):
     problem = Problem(np.zeros(9), np.zeros(9))
     with pytest.raises(ValueError, match="method: must be one of exact"):
         plan(muxarm, problem, "best")
-    with pytest.raises(ValueError, match="exact: has no option width"):
-        plan(muxarm, problem, "exact", width=3)
+    with pytest.raises(ValueError, match="exact: has no option gap"):
+        plan(muxarm, problem, "exact", gap=0.1)
     for method in ("beamstep", "beamstep_printed"):
         with pytest.raises(ValueError, match="width: must be a whole number, at least 1"):
             plan(muxarm, problem, method, width=0)

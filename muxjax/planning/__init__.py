@@ -7,8 +7,10 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 from muxjax.planning.baselines import greedy, reverse, sequential
+from muxjax.planning.batch import PlanBatch, plan_batch
 from muxjax.planning.beamstep import beamstep, beamstep_printed
 from muxjax.planning.exact import exact
+from muxjax.planning.front import FrontPoint, front
 from muxjax.planning.lattice import Lattice
 from muxjax.planning.problem import (
     TERMS,
@@ -32,11 +34,15 @@ METHODS: Mapping[str, Callable[..., Plan]] = {
 __all__ = [
     "METHODS",
     "TERMS",
+    "FrontPoint",
     "Plan",
+    "PlanBatch",
     "PlanningError",
     "Problem",
     "Transition",
+    "front",
     "plan",
+    "plan_batch",
 ]
 
 

@@ -42,7 +42,7 @@ def _run(lattice: Lattice, choose: Policy, to_the_end: bool, method: str) -> Pla
         residual[remaining == 0] = 0.0
         stop = _stop_for(lattice, choose(remaining, residual), stop, residual)
         while True:
-            moves = lattice.reach[stop] & (remaining > 0)
+            moves = (lattice.reach[stop] & (remaining > 0)).astype(np.int64)
             steps.append(Step(stop, moves))
             remaining = remaining - moves
             if not (to_the_end and _unfinished_at(lattice, stop, remaining)):

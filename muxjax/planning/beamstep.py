@@ -6,9 +6,10 @@ import heapq
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from itertools import count
+from time import monotonic
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 
 from muxjax.planning.baselines import greedy, reverse, sequential
 from muxjax.planning.bounds import AdmissibleBound
@@ -30,13 +31,20 @@ class _Level:
     stop: Int[np.ndarray, " N"]
     cost: Float[np.ndarray, " N"]
     parent: Int[np.ndarray, " N"]  # row in the level above
-    moves: Bool[np.ndarray, "N SJ"]  # tendons moved by the last step
+    moves: Int[np.ndarray, "N SJ"]  # steps of each tendon in the last action
 
     def take(self, rows: Int[np.ndarray, " M"]) -> _Level:
         return _Level(*(getattr(self, name)[rows] for name in self.__dataclass_fields__))
 
 
-def beamstep(lattice: Lattice, *, width: int = 64, value_fn: ValueFunction | None = None) -> Plan:
+def beamstep(
+    lattice: Lattice,
+    *,
+    width: int = 64,
+    value_fn: ValueFunction | None = None,
+    gap: float | None = None,
+    deadline_s: float | None = None,
+) -> Plan:
     """Level-synchronous beam search with deduplication and a certified gap.
 
     The baselines' plans are the first incumbents, so the result is never worse than they are. The
@@ -44,54 +52,128 @@ def beamstep(lattice: Lattice, *, width: int = 64, value_fn: ValueFunction | Non
 
     Args:
         lattice: The problem on the robot.
-        width: Partial plans kept at each length, B.
+        width: Partial plans kept at each length, B; the first one where it is doubled.
         value_fn: Orders the plans of a level instead of the admissible bound; it enters neither
             the pruning nor the certificate.
+        gap: Double the width until the certified gap is no larger than this.
+        deadline_s: Double the width as long as no more than this time [s] has passed; a search
+            that was begun is finished.
 
     Raises:
-        ValueError: A width below 1.
+        ValueError: A width below 1, or a gap or deadline that is not a number of at least 0.
     """
-    if not isinstance(width, int) or width < 1:
-        raise ValueError(f"width: must be a whole number, at least 1, found {width!r}")
+    _check_options(width, gap, deadline_s)
+    began = monotonic()
     bound = AdmissibleBound(lattice)
     incumbent = min((rule(lattice) for rule in (sequential, reverse, greedy)), key=lambda p: p.cost)
-    best_cost, best_steps = incumbent.cost, None
-    cut_off, expansions = float("inf"), 0
-    levels = [_root(lattice)]
-    while levels[-1].remaining.any():
-        expansions += len(levels[-1].cost)
-        level = _deduplicated(_children(lattice, levels[-1], first=len(levels) == 1))
-        done = ~level.remaining.any(axis=1)
-        if done.any() and level.cost[done].min() < best_cost:
-            best_cost = float(level.cost[done].min())
-            best_steps = _trace(
-                [*levels, level], int(np.argmin(np.where(done, level.cost, np.inf)))
-            )
-        promise = level.cost + bound(level.remaining, level.stop)
-        hopeful = np.flatnonzero(~done & (promise < best_cost))
-        order = promise if value_fn is None else level.cost + _values(lattice, level, value_fn)
-        ranked = hopeful[np.argsort(order[hopeful], kind="stable")]
-        cut_off = min(cut_off, float(np.min(promise[ranked[width:]], initial=np.inf)))
-        levels.append(level.take(ranked[:width]))
-    optimal = cut_off >= best_cost
-    if best_steps is None and incumbent.status == "failed":
-        return replace(incumbent, method="beamstep", expansions=expansions)
-    if best_steps is None:
+    best = _Incumbent(incumbent.cost, None)
+    proved, expansions = 0.0, 0
+    while True:
+        cut_off, expanded = _search(lattice, bound, width, value_fn, best)
+        proved, expansions = max(proved, cut_off), expansions + expanded
+        tight = proved >= best.cost or (gap is not None and best.cost - proved <= gap * best.cost)
+        late = deadline_s is not None and monotonic() - began >= deadline_s
+        if tight or late or (gap is None and deadline_s is None):
+            break
+        width *= 2
+    if not np.isfinite(best.cost):
+        return _none_found(lattice, width, proved, expansions)
+    optimal = proved >= best.cost
+    if best.steps is None:
         return replace(
             incumbent,
             method="beamstep",
-            lower_bound=min(best_cost, cut_off),
+            lower_bound=min(best.cost, proved),
             expansions=expansions,
             status="optimal" if optimal else "feasible",
         )
     return replay(
         lattice,
-        best_steps,
+        best.steps,
         method="beamstep",
-        lower_bound=cut_off,
+        lower_bound=proved,
         expansions=expansions,
         optimal=optimal,
     )
+
+
+def _check_options(width: int, gap: float | None, deadline_s: float | None) -> None:
+    if not isinstance(width, int) or width < 1:
+        raise ValueError(f"width: must be a whole number, at least 1, found {width!r}")
+    for name, value in (("gap", gap), ("deadline_s", deadline_s)):
+        if value is not None and not value >= 0.0:
+            raise ValueError(f"{name}: must be at least 0, found {value!r}")
+
+
+def _none_found(lattice: Lattice, width: int, proved: float, expansions: int) -> Plan:
+    what = "a collision or " if lattice.problem.world is not None else ""
+    reason = (
+        f"every plan of the action set {lattice.problem.action_set!r} passes through {what}a state "
+        "that is not defined, or whose cost is not finite"
+        if proved == np.inf
+        else f"no plan found at width {width}, where others were cut off; take a larger one"
+    )
+    return failed(lattice, method="beamstep", reason=reason, expansions=expansions)
+
+
+@dataclass
+class _Incumbent:
+    """The best plan so far; no steps if it is a baseline's."""
+
+    cost: float
+    steps: list[Step] | None
+
+
+def _search(
+    lattice: Lattice,
+    bound: AdmissibleBound,
+    width: int,
+    value_fn: ValueFunction | None,
+    best: _Incumbent,
+) -> tuple[float, int]:
+    """One beam; improves ``best`` and returns the least promise cut off, and its expansions."""
+    cut_off, expansions = float("inf"), 0
+    levels = [_root(lattice)]
+    while levels[-1].remaining.any():
+        expansions += len(levels[-1].cost)
+        children = _children(lattice, levels[-1], first=len(levels) == 1)
+        asked = np.full(len(children.cost), not lattice.has_expensive_terms)
+        while True:
+            rows = _deduplicated(children)
+            level = children.take(rows)
+            done = ~level.remaining.any(axis=1)
+            promise = level.cost + bound(level.remaining, level.stop)
+            hopeful = np.flatnonzero(~done & (promise < best.cost))
+            order = level.cost + (
+                bound(level.remaining, level.stop, for_order=True)
+                if value_fn is None
+                else _values(lattice, level, value_fn)
+            )
+            ranked = hopeful[np.argsort(order[hopeful], kind="stable")]
+            arriving = np.flatnonzero(done & (level.cost < best.cost))
+            unsure = rows[np.concatenate([ranked[:width], arriving])]
+            unsure = unsure[~asked[unsure]]
+            if not len(unsure):
+                break
+            asked[unsure] = True
+            first = len(levels) == 1
+            children.cost[unsure] += _expensive(lattice, levels[-1], children.take(unsure), first)
+        if len(arriving):
+            row = arriving[np.argmin(level.cost[arriving])]
+            best.cost, best.steps = float(level.cost[row]), _trace([*levels, level], int(row))
+        cut_off = min(cut_off, float(np.min(promise[ranked[width:]], initial=np.inf)))
+        levels.append(level.take(ranked[:width]))
+    return cut_off, expansions
+
+
+def _expensive(
+    lattice: Lattice, parents: _Level, children: _Level, first: bool
+) -> Float[np.ndarray, " N"]:
+    """What the expensive terms add to the last steps of these plans."""
+    before = children.remaining + children.moves
+    both = lattice.costs(before, children.moves, first=first, expensive=True)
+    stays = children.stop == parents.stop[children.parent]
+    return np.where(stays, both[:, 0], both[:, 1])
 
 
 def _root(lattice: Lattice) -> _Level:
@@ -100,7 +182,7 @@ def _root(lattice: Lattice) -> _Level:
         stop=np.array([lattice.start_stop]),
         cost=np.zeros(1),
         parent=np.zeros(1, dtype=np.int64),
-        moves=np.zeros((1, len(lattice.steps)), dtype=bool),
+        moves=np.zeros((1, len(lattice.steps)), dtype=np.int64),
     )
 
 
@@ -120,13 +202,13 @@ def _children(lattice: Lattice, level: _Level, *, first: bool) -> _Level:
     )
 
 
-def _deduplicated(level: _Level) -> _Level:
-    """The cheapest plan to each state."""
+def _deduplicated(level: _Level) -> Int[np.ndarray, " M"]:
+    """Rows of the cheapest plan to each state."""
     by_cost = np.argsort(level.cost, kind="stable")
     states = np.column_stack([level.remaining, level.stop])[by_cost]
     keys = np.ascontiguousarray(states).view(np.dtype((np.void, states.itemsize * states.shape[1])))
     _, first = np.unique(keys.ravel(), return_index=True)
-    return level.take(by_cost[np.sort(first)])
+    return by_cost[np.sort(first)]
 
 
 def _values(lattice: Lattice, level: _Level, value_fn: ValueFunction) -> Float[np.ndarray, " N"]:
@@ -199,21 +281,20 @@ def beamstep_printed(lattice: Lattice, *, width: int = 64, max_expansions: int =
 
 
 def _successors(lattice: Lattice, node: _Node) -> list[_Node]:
-    level = _children(
-        lattice,
-        _Level(
-            remaining=node.remaining[None],
-            stop=np.array([node.stop]),
-            cost=np.array([node.cost]),
-            parent=np.zeros(1, dtype=np.int64),
-            moves=np.zeros((1, len(node.remaining)), dtype=bool),
-        ),
-        first=not node.steps,
+    parent = _Level(
+        remaining=node.remaining[None],
+        stop=np.array([node.stop]),
+        cost=np.array([node.cost]),
+        parent=np.zeros(1, dtype=np.int64),
+        moves=np.zeros((1, len(node.remaining)), dtype=np.int64),
     )
+    first = not node.steps
+    level = _children(lattice, parent, first=first)
+    costs = level.cost + _expensive(lattice, parent, level, first)
     return [
         _Node(remaining, int(stop), float(cost), (*node.steps, Step(int(stop), moves)))
         for remaining, stop, cost, moves in zip(
-            level.remaining, level.stop, level.cost, level.moves, strict=True
+            level.remaining, level.stop, costs, level.moves, strict=True
         )
         if np.isfinite(cost)
     ]

@@ -1,129 +1,178 @@
-"""The certified optimum by dynamic programming over the lattice (MODEL.md section 5)."""
+"""The certified optimum of the problem's action set (MODEL.md section 5).
+
+A table of the cost to go comes first (``table.py``), without the expensive terms. Without such
+terms the plan follows the table's minimum. With them it is the table that guides a best-first
+search, which asks an expensive term only about a step that the cheapest plan so far would take:
+no term is negative, so the table never overestimates, and the first plan to arrive is the optimum.
+"""
 
 from __future__ import annotations
 
-import math
+import heapq
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float, Int
 
+from muxjax.planning.beamstep import beamstep
 from muxjax.planning.lattice import Lattice
-from muxjax.planning.problem import Plan, PlanningError
+from muxjax.planning.problem import Plan
 from muxjax.planning.replay import Step, failed, replay
+from muxjax.planning.table import Table, TableTooLargeError, solved_table
 
 DEFAULT_MEMORY = 2 * 2**30  # [bytes]
-# Beside its values (float64 at every stop), a state has its steps to go and its place in the order.
-_BYTES_PER_STATE = 24
-# A possible step of a state while its chunk is worked on: masks and states, by tendon.
-_BYTES_PER_STEP_AND_TENDON = 48
-_CHUNK_BYTES = 64 * 2**20
+_CHECKED_AT_ONCE = 64  # steps about which an expensive term is asked in one call
+_DECIMALS = 10  # costs that differ by less count as equal, and the plan nearer its end goes first
 
 
-def exact(lattice: Lattice, *, memory_limit: int = DEFAULT_MEMORY) -> Plan:
+def exact(
+    lattice: Lattice, *, memory_limit: int = DEFAULT_MEMORY, fallback: bool = False, width: int = 64
+) -> Plan:
     """The cheapest plan of the problem's action set, certified.
-
-    States are solved in the order of their steps to go, so that every successor is known: with
-    V[s, p] the cost to go from state s at stop p,
-    V[s, p] = min over actions (k, moves) of cost(s, moves, p != k) + V[s - moves, k].
 
     Args:
         lattice: The problem on the robot.
         memory_limit: Most memory that the table may take [bytes].
+        fallback: Where it would take more, use the layered beam, whose gap is bounded; the plan's
+            ``method`` and ``reason`` say so.
+        width: Partial plans that this beam keeps.
 
     Raises:
         PlanningError: The table does not fit, and the message says how large it would be; or a
             cost term is negative, or lower with a repositioning than without.
     """
-    solver = _Table(lattice, memory_limit)
-    solver.fill()
-    return solver.plan()
+    try:
+        table = solved_table(lattice, memory_limit)
+    except TableTooLargeError as refusal:
+        if not fallback:
+            raise
+        found = beamstep(lattice, width=width)
+        why = f"{refusal}; this is the beam's plan" + (found.reason and f", {found.reason}")
+        return replace(found, reason=why)
+    steps, reason = (_cheapest if lattice.has_expensive_terms else _follow)(lattice, table)
+    if steps is None:
+        return failed(lattice, method="exact", reason=reason, expansions=table.expansions)
+    return replay(lattice, steps, method="exact", expansions=table.expansions, optimal=True)
 
 
-class _Table:
-    """The value table and the sweep that fills it."""
+def _follow(lattice: Lattice, table: Table) -> tuple[list[Step] | None, str]:
+    """The table's minimum from the start."""
+    remaining, stop, steps = lattice.steps, lattice.start_stop, list[Step]()
+    while remaining.any():
+        choices = table.choices(remaining, stop, first=not steps)
+        through = choices.cost + choices.to_go
+        best = int(np.argmin(through))
+        if not np.isfinite(through[best]):
+            return None, "every order passes through a state that is not defined"
+        stop = int(choices.stop[best])
+        steps.append(Step(stop, choices.moves[best]))
+        remaining = remaining - choices.moves[best]
+    return steps, ""
 
-    def __init__(self, lattice: Lattice, memory_limit: int) -> None:
-        self.lattice = lattice
-        self.shape = lattice.steps + 1
-        states, stops = math.prod(int(n) for n in self.shape), len(lattice.reach)
-        actions, tendons = lattice.actions[1].shape
-        a_state = actions * tendons * _BYTES_PER_STEP_AND_TENDON
-        self.chunk = min(max(1, _CHUNK_BYTES // a_state), states)
-        needed = states * (8 * stops + _BYTES_PER_STATE) + self.chunk * a_state
-        if needed > memory_limit:
-            raise PlanningError(
-                f"exact: {states:.3g} states at {stops} stops need {needed / 2**30:.3g} GiB, the "
-                f"limit is {memory_limit / 2**30:.3g} GiB; take a larger max_step, or 'beamstep', "
-                "which reports its gap"
+
+@dataclass(frozen=True, eq=False)
+class _Node:
+    """A state reached at its least cost."""
+
+    remaining: Int[np.ndarray, " SJ"]
+    stop: int
+    cost: float
+    steps: tuple[Step, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class _Edge:
+    """A step that may be taken; costs are without what expensive terms add to this step."""
+
+    begin: _Node
+    step: Step
+    cost: float  # from the start to its end
+    to_go: float  # from there, by the table
+
+    @property
+    def leg(self) -> tuple[bytes, bytes]:
+        """State and moves; first steps, which all begin at the start, have no other state."""
+        return self.begin.remaining.tobytes(), self.step.moves.tobytes()
+
+    @property
+    def remaining(self) -> Int[np.ndarray, " SJ"]:
+        """State after the step."""
+        return self.begin.remaining - self.step.moves
+
+
+class _Search:
+    """Best-first search with the table as heuristic."""
+
+    def __init__(self, lattice: Lattice, table: Table) -> None:
+        self.lattice, self.table = lattice, table
+        self.edges: list[_Edge] = []
+        # What the expensive terms add, once asked: without and with a repositioning, by leg.
+        self.extra: dict[tuple[bytes, bytes], Float[np.ndarray, " 2"]] = {}
+        self.heap: list[tuple[float, int, int, bool]] = []  # estimate, steps to go, edge, final
+        self.reached: set[tuple[bytes, int]] = set()
+
+    def run(self) -> list[Step] | None:
+        """The cheapest steps to the target, or None."""
+        self._expand(_Node(self.lattice.steps, self.lattice.start_stop, 0.0, ()))
+        while self.heap:
+            _, _, number, final = heapq.heappop(self.heap)
+            if not final:
+                self._push(number, self._ask(number), final=True)
+                continue
+            edge = self.edges[number]
+            cost = edge.cost + self._ask(number)
+            node = _Node(edge.remaining, edge.step.stop, cost, (*edge.begin.steps, edge.step))
+            if not node.remaining.any():
+                return list(node.steps)
+            self._expand(node)
+        return None
+
+    def _expand(self, node: _Node) -> None:
+        state = (node.remaining.tobytes(), node.stop)
+        if state in self.reached:
+            return
+        self.reached.add(state)
+        choices = self.table.choices(node.remaining, node.stop, first=not node.steps)
+        for stop, moves, cost, to_go in zip(*choices, strict=True):
+            edge = _Edge(node, Step(int(stop), moves), node.cost + float(cost), float(to_go))
+            self.edges.append(edge)
+            self._push(len(self.edges) - 1, 0.0, final=False)
+
+    def _push(self, number: int, extra: float, *, final: bool) -> None:
+        edge = self.edges[number]
+        estimate = edge.cost + extra + edge.to_go
+        if np.isfinite(estimate):
+            to_go = int(edge.remaining.sum())
+            heapq.heappush(self.heap, (round(estimate, _DECIMALS), to_go, number, final))
+
+    def _ask(self, number: int) -> float:
+        """What the expensive terms add to a step; asked in one call with those soon to come."""
+        edge = self.edges[number]
+        if edge.leg not in self.extra:
+            first = not edge.begin.steps
+            legs = {edge.leg: edge}
+            for _, _, n, _ in heapq.nsmallest(2 * _CHECKED_AT_ONCE, self.heap):
+                other = self.edges[n]
+                if other.leg not in self.extra and (not other.begin.steps) == first:
+                    legs.setdefault(other.leg, other)
+            asked = list(legs.values())[:_CHECKED_AT_ONCE]
+            costs = self.lattice.costs(
+                np.array([e.begin.remaining for e in asked]),
+                np.array([e.step.moves for e in asked]),
+                first=first,
+                expensive=True,
             )
-        self.strides = np.concatenate([np.cumprod(self.shape[::-1])[::-1][1:], [1]])
-        self.value = np.full((states, stops), np.inf)
-        self.expansions = 0
+            self.extra.update(zip((e.leg for e in asked), costs, strict=True))
+        return float(self.extra[edge.leg][int(edge.step.stop != edge.begin.stop)])
 
-    def remaining(self, index: Int[np.ndarray, " N"]) -> Int[np.ndarray, "N SJ"]:
-        """Mixed-radix digits of flat indices."""
-        return index[:, None] // self.strides % self.shape
 
-    def fill(self) -> None:
-        """Solve all states, those with fewer steps to go first."""
-        to_go = np.zeros(1, dtype=np.int32)
-        for n in self.shape:
-            to_go = (to_go[:, None] + np.arange(n, dtype=np.int32)).reshape(-1)
-        order = np.argsort(to_go, kind="stable")
-        layers = np.split(order, np.cumsum(np.bincount(to_go))[:-1])
-        self.value[layers[0]] = 0.0
-        for layer in layers[1:]:
-            for i in range(0, len(layer), self.chunk):
-                chunk = layer[i : i + self.chunk]
-                stay, switch = self.action_values(chunk)
-                self.value[chunk] = self.best_by_stop(stay, switch)
-
-    def action_values(
-        self, index: Int[np.ndarray, " N"], *, first: bool = False
-    ) -> tuple[Float[np.ndarray, "N G"], Float[np.ndarray, "N G"]]:
-        """Cost to go through each action, without and with a repositioning before it."""
-        remaining = self.remaining(index)
-        stops, masks = self.lattice.actions
-        possible, moves = self.lattice.expand(remaining)
-        state, action = np.nonzero(possible)
-        self.expansions += len(index)
-        moved = moves[state, action]
-        after = self.value[index[state] - moved @ self.strides, stops[action]]
-        costs = self.lattice.costs(remaining[state], moved, first=first)
-        if (costs[:, 1] < costs[:, 0]).any():
-            raise PlanningError("exact: a cost term pays for repositioning, which has no optimum")
-        through = np.full((2, len(index), len(masks)), np.inf)
-        through[:, state, action] = costs.T + after
-        return through[0], through[1]
-
-    def best_by_stop(
-        self, stay: Float[np.ndarray, "N G"], switch: Float[np.ndarray, "N G"]
-    ) -> Float[np.ndarray, "N stops"]:
-        """Minimum over actions, for every stop the axial motor may be at."""
-        stops, _ = self.lattice.actions
-        elsewhere = switch.min(axis=1, keepdims=True)
-        # Actions of one stop stand next to each other.
-        here = np.minimum.reduceat(stay, np.flatnonzero(np.diff(stops, prepend=-1)), axis=1)
-        return np.minimum(here, elsewhere)
-
-    def plan(self) -> Plan:
-        """Follow the minimum from the start."""
-        stops, masks = self.lattice.actions
-        index, stop = len(self.value) - 1, self.lattice.start_stop
-        steps: list[Step] = []
-        expansions = self.expansions
-        while index:
-            stay, switch = self.action_values(np.array([index]), first=not steps)
-            if not np.isfinite(min(stay.min(), switch.min())):
-                return failed(
-                    self.lattice,
-                    method="exact",
-                    reason="every order passes through a state that is not defined",
-                    expansions=expansions,
-                )
-            action = int(np.argmin(np.where(stops == stop, stay[0], switch[0])))
-            moves = masks[action] & (self.remaining(np.array([index]))[0] > 0)
-            stop = int(stops[action])
-            steps.append(Step(stop, moves))
-            index -= int(moves @ self.strides)
-        return replay(self.lattice, steps, method="exact", expansions=expansions, optimal=True)
+def _cheapest(lattice: Lattice, table: Table) -> tuple[list[Step] | None, str]:
+    """As ``_follow``, where expensive terms have a say."""
+    search = _Search(lattice, table)
+    steps = search.run() if lattice.steps.any() else []
+    blocked = sum(not np.isfinite(both).any() for both in search.extra.values())
+    what = "a collision" if lattice.problem.world is not None else "a cost that is not finite"
+    return steps, (
+        f"every plan of the action set {lattice.problem.action_set!r} passes through {what} or an "
+        f"undefined state: {blocked} of {len(search.extra)} steps that were looked at are blocked"
+    )

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property, partial
-from itertools import combinations
+from itertools import combinations, product
 
 import jax
 import jax.numpy as jnp
@@ -17,19 +17,14 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from muxjax.planning.motion import bending_angles
-from muxjax.planning.problem import (
-    PlanningError,
-    Problem,
-    Term,
-    clipped_move,
-    step,
-    transition_cost,
-)
+from muxjax.planning.problem import PlanningError, Problem
+from muxjax.planning.terms import CostTerm, step, transition_cost
 from muxjax.precision import pad_rows
 from muxjax.robot import Robot
 
 Array = jax.Array | np.ndarray
 _LARGEST_BATCH = 16384
+_EXPENSIVE_BATCH = 64  # always this many: such terms take long to compile
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,18 +77,34 @@ class Lattice:
         return axial[stops]
 
     @cached_property
-    def actions(self) -> tuple[Int[np.ndarray, " G"], Bool[np.ndarray, "G SJ"]]:
-        """Stop and tendons of every action: a stop's whole reach, or each subset of it."""
-        whole = self.problem.action_set == "all"
+    def actions(self) -> tuple[Int[np.ndarray, " G"], Int[np.ndarray, "G SJ"]]:
+        """Stop of every action, and how many steps it moves each tendon, at most."""
         rows = []
         for stop, reach in enumerate(self.reach):
             tendons = np.flatnonzero(reach)
-            for size in range(len(tendons) if whole else 1, len(tendons) + 1):
-                rows += [(stop, chosen) for chosen in combinations(tendons, size)]
-        masks = np.zeros((len(rows), self.robot.n_tendons), dtype=bool)
-        for mask, (_, chosen) in zip(masks, rows, strict=True):
-            mask[list(chosen)] = True
-        return np.array([stop for stop, _ in rows]), masks
+            for counts in self._counts(tendons):
+                row = np.zeros(self.robot.n_tendons, dtype=np.int64)
+                row[tendons] = counts
+                rows.append((stop, row))
+        return np.array([stop for stop, _ in rows]), np.array([row for _, row in rows])
+
+    @cached_property
+    def one_layer_a_step(self) -> bool:
+        """Whether all tendons that can move in one step belong to one layer."""
+        by_layer = self.reach.reshape(len(self.reach), self.robot.n_segments, -1).any(axis=-1)
+        return bool((by_layer.sum(axis=-1) == 1).all())
+
+    def _counts(self, tendons: Int[np.ndarray, " n"]) -> list[tuple[int, ...]]:
+        """Steps of the tendons reached at one stop, for each action there."""
+        if self.problem.action_set == "all":
+            return [(1,) * len(tendons)]
+        if self.problem.action_set == "subsets":
+            sizes = range(1, len(tendons) + 1)
+            subsets = (c for size in sizes for c in combinations(range(len(tendons)), size))
+            return [tuple(int(i in chosen) for i in range(len(tendons))) for chosen in subsets]
+        return list(product(*(range(int(n) + 1) for n in self.steps[tendons])))[1:] or [
+            (1,) * len(tendons)
+        ]
 
     def displacements(self, remaining: Int[np.ndarray, "*n SJ"]) -> Float[np.ndarray, "*n SJ"]:
         """Displacements [m] of states."""
@@ -103,87 +114,108 @@ class Lattice:
 
     def expand(
         self, remaining: Int[np.ndarray, "N SJ"]
-    ) -> tuple[Bool[np.ndarray, "N G"], Bool[np.ndarray, "N G SJ"]]:
-        """Which actions are possible in each state, and the tendons that then move.
+    ) -> tuple[Bool[np.ndarray, "N G"], Int[np.ndarray, "N G SJ"]]:
+        """Which actions are possible in each state, and the steps that each tendon then moves.
 
         A subset must consist of unfinished tendons; a whole reach moves those that are unfinished.
         """
-        _, masks = self.actions
-        moves = masks & (remaining[:, None, :] > 0)
+        _, counts = self.actions
+        moves = np.minimum(counts, remaining[:, None, :])
         if self.problem.action_set == "all":
             return np.any(moves, axis=-1), moves
-        return np.all(moves == masks, axis=-1), moves
+        return np.all(moves == counts, axis=-1), moves
 
     def costs(
         self,
         remaining: Int[np.ndarray, "N SJ"],
-        moves: Bool[np.ndarray, "N SJ"],
+        moves: Int[np.ndarray, "N SJ"],
         *,
         first: bool = False,
+        expensive: bool = False,
     ) -> Float[np.ndarray, "N 2"]:
-        """Cost of moving tendons one step, without and with an axial repositioning before it.
+        """Cost of moving tendons by some steps, without and with a repositioning before it.
 
         A step into a state that the formulas do not define (tendons wound in by more than a
         segment's length), or whose cost is not finite, costs infinitely much.
 
         Args:
             remaining: States before the step.
-            moves: Tendons that move.
+            moves: Steps that each tendon moves.
             first: These are first steps: without repositioning, clutches still engage.
+            expensive: The cost by the expensive terms instead of that by the others.
 
         Raises:
             PlanningError: A negative cost, on which no bound could rest.
         """
-        before = self.displacements(remaining)
-        starts = range(0, len(before), _LARGEST_BATCH)
-        parts = [np.zeros((0, 2))]
-        for batch in (slice(i, i + _LARGEST_BATCH) for i in starts):
-            parts.append(self._costs_of_batch(before[batch], moves[batch], first))
+        terms, weights = self._compiled_terms[expensive]
+        if expensive and not terms:
+            return np.zeros((len(remaining), 2))
+        before, after = self.displacements(remaining), self.displacements(remaining - moves)
+        size = _EXPENSIVE_BATCH if expensive else _LARGEST_BATCH
+        parts: list[np.ndarray] = [np.zeros((0, 2))]
+        for i in range(0, len(before), size):
+            batch = slice(i, i + size)
+            with jax.enable_x64(True):
+                batch_costs = _batch_costs(
+                    self.robot,
+                    terms,
+                    weights,
+                    _padded(before[batch], expensive),
+                    _padded((after - before)[batch], expensive),
+                    self.problem.target,
+                    np.float64(first),
+                    one_code=expensive,
+                )
+                parts.append(np.asarray(batch_costs)[: len(before[batch])])
         costs = np.concatenate(parts)
         costs = np.where(np.isfinite(costs), costs, np.inf)
         if (costs < 0).any():
             raise PlanningError("a cost term is negative; terms must be at least 0")
         return costs
 
-    def _costs_of_batch(
-        self, before: Float[np.ndarray, "N SJ"], moves: Bool[np.ndarray, "N SJ"], first: bool
-    ) -> Float[np.ndarray, "N 2"]:
-        with jax.enable_x64(True):
-            costs = _batch_costs(
-                self.robot,
-                self.problem.weighted_terms,
-                self.problem.weight_vector,
-                pad_rows(before),
-                pad_rows(moves.astype(np.float64)),
-                self.problem.target,
-                np.float64(self.max_step),
-                np.float64(first),
-            )
-            return np.asarray(costs)[: len(before)]
+    @property
+    def has_expensive_terms(self) -> bool:
+        """Whether some terms are to be asked only about steps that would otherwise be taken."""
+        return len(self._compiled_terms[True][0]) > 0
+
+    @cached_property
+    def _compiled_terms(
+        self,
+    ) -> dict[bool, tuple[tuple[CostTerm, ...], Float[np.ndarray, " T"]]]:
+        return {e: self.problem.compiled_terms(expensive=e) for e in (False, True)}
 
 
-@partial(jax.jit, static_argnums=1)
+def _padded(rows: Float[np.ndarray, "N SJ"], expensive: bool) -> Float[np.ndarray, "M SJ"]:
+    if not expensive:
+        return pad_rows(rows)
+    return np.pad(rows, ((0, _EXPENSIVE_BATCH - len(rows)), (0, 0)))
+
+
+@partial(jax.jit, static_argnames="one_code")
 def _batch_costs(
     robot: Robot,
-    terms: tuple[tuple[str, Term], ...],
+    terms: tuple[CostTerm, ...],
     weights: Float[Array, " T"],
     before: Float[Array, "N SJ"],
-    chosen: Float[Array, "N SJ"],
+    move: Float[Array, "N SJ"],
     target: Float[Array, " SJ"],
-    max_step: Float[Array, ""],
     first: Float[Array, ""],
+    *,
+    one_code: bool,
 ) -> Float[Array, "N 2"]:
+    """Both costs of steps; ``one_code`` runs the terms twice rather than compile them twice."""
     goal = bending_angles(robot, target)
-    move = clipped_move(before, target, chosen, max_step)
 
-    def cost(repositions: float) -> Float[Array, " N"]:
+    def cost(repositions: Float[Array, ""] | float) -> jax.Array:
         flags = jnp.full(before.shape[0], repositions)
         engages = (1.0 - flags) * first
-        return transition_cost(
-            robot, terms, weights, step(robot, before, move, flags, engages, goal)
-        )
+        moved = step(robot, before, move, flags, engages, goal)
+        return jnp.asarray(transition_cost(robot, terms, weights, moved))
 
     # A state that is not defined makes its step impossible, whatever the terms look at.
     defined = jnp.all(jnp.isfinite(bending_angles(robot, before + move)), axis=-1)
-    both = jnp.stack([cost(0.0), cost(1.0)], axis=-1)
+    if one_code:
+        both = jax.lax.map(cost, jnp.array([0.0, 1.0])).T
+    else:
+        both = jnp.stack([cost(0.0), cost(1.0)], axis=-1)
     return jnp.where(defined[:, None], both, jnp.inf)

@@ -20,7 +20,7 @@ Array = jax.Array | np.ndarray
 STRAIGHT = 0.02  # [rad]
 # |theta| > |theta_inf| is judged with this margin, or rounding would count the time after arrival.
 ANGLE_TOLERANCE = 1e-6  # [rad]
-_INTEGRATION_POINTS = 8
+LEG_POINTS = 8
 _PROFILE_INTERVALS = 128
 
 
@@ -49,25 +49,25 @@ def leg_time(robot: Robot, move: Float[Array, "*n SJ"]) -> Float[Array, "*n"]:
 
 
 def relative_excess(
-    robot: Robot, displacements: Float[Array, "*n SJ"], goal: Float[Array, "*#n S"]
+    angles: Float[Array, "*n S"], goal: Float[Array, "*#n S"]
 ) -> Float[Array, "*n"]:
     """Sum over segments of (theta - theta_goal)_+ / theta_goal, the integrand of overshoot."""
-    over = jnp.maximum(bending_angles(robot, displacements) - goal, 0.0)
-    return jnp.sum(over / jnp.maximum(goal, STRAIGHT), axis=-1)
+    return jnp.sum(jnp.maximum(angles - goal, 0.0) / jnp.maximum(goal, STRAIGHT), axis=-1)
 
 
-def leg_overshoot(
-    robot: Robot,
-    before: Float[Array, "*n SJ"],
-    after: Float[Array, "*n SJ"],
-    goal: Float[Array, "*#n S"],
-) -> Float[Array, "*n"]:
-    """Time integral [s] of ``relative_excess`` over a leg, by the midpoint rule with 8 points."""
-    fraction = (jnp.arange(_INTEGRATION_POINTS) + 0.5) / _INTEGRATION_POINTS
-    move = after - before
-    points = before[..., None, :] + fraction[:, None] * move[..., None, :]
-    excess = relative_excess(robot, points, jnp.asarray(goal)[..., None, :])
-    return leg_time(robot, move) * jnp.mean(excess, axis=-1)
+def leg_points(
+    before: Float[Array, "*n SJ"], after: Float[Array, "*n SJ"]
+) -> Float[Array, "*n points SJ"]:
+    """Displacements [m] at the midpoints of 8 equal parts of a leg, for integrals over it."""
+    fraction = (jnp.arange(LEG_POINTS) + 0.5) / LEG_POINTS
+    return before[..., None, :] + fraction[:, None] * (after - before)[..., None, :]
+
+
+def angles_along(
+    robot: Robot, before: Float[Array, "*n SJ"], after: Float[Array, "*n SJ"]
+) -> Float[Array, "*n points S"]:
+    """Bending angles [rad] at ``leg_points``."""
+    return bending_angles(robot, leg_points(before, after))
 
 
 def overshoot_profile(

@@ -1,35 +1,48 @@
-"""The planning problem: transition rule, cost terms and the Plan (M Eq. 7-9, MODEL.md section 5).
+"""The planning problem and the Plan (M Eq. 7-9, MODEL.md section 5).
 
 A state is the tendon displacements and the last axial position. A step names an axial position
 and explicit displacements of tendons that the available servos reach there; planners differ only
-in which steps they choose. The cost of a step is a weighted sum of named terms, each a small
-function of the transition.
+in which steps they choose. The cost of a step is a weighted sum of named terms (``terms.py``).
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cached_property, lru_cache
+from pathlib import Path
 from types import MappingProxyType
-from typing import Annotated, Any, Literal, NamedTuple
+from typing import Annotated, Any, Literal
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 from pydantic import Field
 
+from muxjax.collision import World, clearance
 from muxjax.config import Sourced, Strict, load_yaml, resolve
 from muxjax.kinematics import check_configuration
-from muxjax.planning.motion import bending_angles, leg_overshoot, leg_time, relative_excess
+from muxjax.planning.terms import (
+    TERMS,
+    ByIdentity,
+    CostTerm,
+    Term,
+    Transition,
+    cost_term,
+    is_expensive,
+    step,
+)
+from muxjax.planning.world import Clearance, Collision
 from muxjax.precision import host_array
 from muxjax.robot import Robot
 from muxjax.tendons import check_displacements, configuration_from_tendons
 
-Array = jax.Array | np.ndarray
+ACTION_SETS = ("subsets", "all", "multistep")
+COLLISION = "collision"  # the name under which a world's hard term stands among the weights
+
+__all__ = ["TERMS", "Plan", "PlanningError", "Problem", "Term", "Transition", "step"]
 
 
 def _is_number(value: object) -> bool:
@@ -38,55 +51,6 @@ def _is_number(value: object) -> bool:
 
 class PlanningError(RuntimeError):
     """A planner that cannot do what was asked; the message says why and what would work."""
-
-
-class Transition(NamedTuple):
-    """One step of the arm, as cost terms see it. Any leading batch axes."""
-
-    before: Float[Array, "*n SJ"]  # displacements [m]
-    after: Float[Array, "*n SJ"]  # [m]
-    repositions: Float[Array, "*n"]  # 1 where the axial motor moves first, else 0
-    wait: Float[Array, "*n"]  # time spent at `before` until the tendons move [s]: t_sw, or the
-    # engagement alone for a first step at the axial position where the drum stands, or 0
-    goal: Float[Array, "*#n S"]  # bending angles of the target [rad]
-
-
-Term = Callable[[Robot, Transition], Float[Array, "*n"]]
-
-
-def travel(robot: Robot, t: Transition) -> Float[Array, "*n"]:
-    """Sum of |dl| [m] (M Eq. 8)."""
-    return jnp.sum(jnp.abs(t.after - t.before), axis=-1)
-
-
-def bending(robot: Robot, t: Transition) -> Float[Array, "*n"]:
-    """|theta(l^k)|^2 [rad^2] at the end of the step (M Eq. 8)."""
-    return jnp.sum(bending_angles(robot, t.after) ** 2, axis=-1)
-
-
-def switches(robot: Robot, t: Transition) -> Float[Array, "*n"]:
-    """Axial repositionings, the first one included (M Eq. 8)."""
-    return t.repositions
-
-
-def time(robot: Robot, t: Transition) -> Float[Array, "*n"]:
-    """Execution time [s] (M Eq. 14)."""
-    return t.wait + leg_time(robot, t.after - t.before)
-
-
-def overshoot(robot: Robot, t: Transition) -> Float[Array, "*n"]:
-    """Relative overshoot integrated over waiting and motion [s] (M Eq. 15, made additive)."""
-    waiting = t.wait * relative_excess(robot, t.before, t.goal)
-    return waiting + leg_overshoot(robot, t.before, t.after, t.goal)
-
-
-TERMS: Mapping[str, Term] = {
-    "travel": travel,
-    "bending": bending,
-    "switches": switches,
-    "time": time,
-    "overshoot": overshoot,
-}
 
 
 class PlannerConfig(Strict):
@@ -103,7 +67,15 @@ def preset_weights(name_or_path: str) -> dict[str, float]:
     Raises:
         ConfigError: No such preset, or a file with wrong values.
     """
-    preset = load_yaml(PlannerConfig, resolve(name_or_path, "planners"))
+    path = resolve(name_or_path, "planners")
+    return dict(_weights_of_file(path, path.stat().st_mtime_ns))
+
+
+@lru_cache
+def _weights_of_file(path: Path, changed: int) -> Mapping[str, float]:
+    """A file as it was when it was last changed; reading it takes longer than most plans."""
+    del changed  # part of the key only
+    preset = load_yaml(PlannerConfig, path)
     return {name: weight.value for name, weight in preset.weights.items()}
 
 
@@ -121,9 +93,14 @@ class Problem:
         weights: Weights by term name instead of a preset.
         terms: Your own cost terms by name, beside those of ``TERMS``; none may be negative, and
             one that is not finite forbids its step.
+        world: Obstacles. A step that passes through a collision is then forbidden, and the term
+            "clearance" (``world.Clearance``) may have a weight.
         axial: Axial position now, if known; otherwise the first step repositions.
-        action_set: ``"subsets"``: any non-empty subset of the tendons that the servos reach at an
-            axial position; ``"all"``: all of them that still have to move (the paper's).
+        action_set: Moves are towards the target, and a step moves, at an axial position,
+            ``"subsets"``: any non-empty subset of the tendons that the servos reach there, each by
+            one step of the lattice; ``"all"``: all of them that still have to move (the paper's);
+            ``"multistep"``: any subset, each tendon by any number of its remaining steps, in one
+            straight motion. In the first and the last a tendon may be visited more than once.
 
     Raises:
         ValueError: A field that no robot could satisfy. What depends on the robot is checked by
@@ -140,6 +117,7 @@ class Problem:
     terms: Mapping[str, Term] = field(default_factory=dict)
     axial: int | None = None
     action_set: str = "subsets"
+    world: World | None = None
 
     def __post_init__(self) -> None:
         for name in ("start", "target"):
@@ -160,10 +138,13 @@ class Problem:
             )
         if self.axial is not None and not isinstance(self.axial, (int, np.integer)):
             raise ValueError(f"Problem.axial: must be a whole number or None, found {self.axial!r}")
-        if self.action_set not in ("subsets", "all"):
+        if self.action_set not in ACTION_SETS:
             raise ValueError(
-                f"Problem.action_set: must be 'subsets' or 'all', found {self.action_set!r}"
+                f"Problem.action_set: must be one of {', '.join(ACTION_SETS)}, "
+                f"found {self.action_set!r}"
             )
+        if not isinstance(self.world, World | None):
+            raise ValueError(f"Problem.world: must be a World or None, found {self.world!r}")
         self._check_weights()
 
     def _checked_servos(self) -> tuple[int, ...]:
@@ -180,10 +161,11 @@ class Problem:
     def _check_weights(self) -> None:
         if not isinstance(self.preset, str):
             raise ValueError(f"Problem.preset: must be a name or a path, found {self.preset!r}")
-        known = {**TERMS, **self.terms}
+        known = self._known_terms
         for name, weight in self.cost_weights.items():
             if name not in known:
-                raise ValueError(f"Problem.weights: no term {name!r} among {sorted(known)}")
+                hint = "; it needs a world" if name == "clearance" else ""
+                raise ValueError(f"Problem.weights: no term {name!r} among {sorted(known)}{hint}")
             if not (_is_number(weight) and weight >= 0):
                 raise ValueError(f"Problem.weights[{name!r}]: must be at least 0, found {weight!r}")
         if not self.cost_weights:
@@ -196,18 +178,40 @@ class Problem:
     def cost_weights(self) -> Mapping[str, float]:
         """Weight of each cost term."""
         weights = preset_weights(self.preset) if self.weights is None else dict(self.weights)
+        if self.world is not None:
+            weights[COLLISION] = 1.0  # of a term that is zero or infinite
         return MappingProxyType(weights)
 
-    @property
+    @cached_property
+    def _known_terms(self) -> Mapping[str, Term]:
+        of_world: dict[str, Term] = {}
+        if self.world is not None:
+            of_world = {"clearance": Clearance(self.world), COLLISION: Collision(self.world)}
+        return {**TERMS, **of_world, **self.terms}
+
+    @cached_property
     def weighted_terms(self) -> tuple[tuple[str, Term], ...]:
-        """The cost terms in a fixed order, for compiled functions."""
-        known = {**TERMS, **self.terms}
-        return tuple((name, known[name]) for name in sorted(self.cost_weights))
+        """The cost terms in a fixed order, hashable for compiled functions."""
+        chosen = ((name, self._known_terms[name]) for name in sorted(self.cost_weights))
+        return tuple(
+            (name, ByIdentity(t) if isinstance(t, eqx.Module) else t) for name, t in chosen
+        )
 
     @property
     def weight_vector(self) -> Float[np.ndarray, " T"]:
         """Weights in the order of ``weighted_terms``."""
         return np.array([self.cost_weights[name] for name, _ in self.weighted_terms])
+
+    def compiled_terms(
+        self, *, expensive: bool
+    ) -> tuple[tuple[CostTerm, ...], Float[np.ndarray, " T"]]:
+        """Those terms that are, or are not, expensive, as compiled functions take them; weights."""
+        chosen = [
+            (cost_term(self._known_terms[name]), self.cost_weights[name])
+            for name in sorted(self.cost_weights)
+            if is_expensive(self._known_terms[name]) == expensive
+        ]
+        return tuple(term for term, _ in chosen), np.array([weight for _, weight in chosen])
 
 
 class Plan(eqx.Module):
@@ -227,6 +231,7 @@ class Plan(eqx.Module):
     method: str = eqx.field(static=True)
     status: Literal["optimal", "feasible", "failed"] = eqx.field(static=True)
     reason: str = eqx.field(static=True, default="")
+    action_set: str = eqx.field(static=True, default="subsets")  # what status and bound are for
 
     @property
     def gap(self) -> float:
@@ -248,18 +253,10 @@ def check_problem(robot: Robot, problem: Problem) -> None:
     """Everything about a problem that depends on the robot.
 
     Raises:
-        ValueError: Start or target of wrong length or beyond a tendon's range, a target bent
-            beyond a segment's limit, an unknown servo or axial position.
+        ValueError: Start or target of wrong length, beyond a tendon's range or in collision, a
+            target bent beyond a segment's limit, an unknown servo or axial position.
     """
-    check_displacements(robot, "Problem.start", problem.start)
-    check_displacements(robot, "Problem.target", problem.target)
-    bent = configuration_from_tendons(robot, problem.target)
-    if not np.isfinite(bent).all():
-        raise ValueError("Problem.target: tendons are wound in by more than a segment's length")
-    try:
-        check_configuration(robot, bent)
-    except ValueError as error:
-        raise ValueError(f"Problem.target: {error}") from None
+    check_ends(robot, "Problem.start", problem.start, "Problem.target", problem.target)
     n_axial, n_servos = robot.axial_map.shape
     for servo in problem.servos:
         if not 1 <= servo <= n_servos:
@@ -268,53 +265,33 @@ def check_problem(robot: Robot, problem: Problem) -> None:
         raise ValueError(
             f"Problem.axial: the robot has positions 1 to {n_axial}, found {problem.axial}"
         )
+    if problem.world is not None:
+        _check_clear(robot, problem, problem.world)
 
 
-def clipped_move(
-    displacements: Float[Array, "*n SJ"],
-    target: Float[Array, " SJ"],
-    chosen: Float[Array, "*n SJ"],
-    max_step: Float[Array, ""] | float,
-) -> Float[Array, "*n SJ"]:
-    """clip(l* - l, -d_max, d_max) for the chosen tendons, 0 for the others (MODEL.md section 5)."""
-    return jnp.clip(target - displacements, -max_step, max_step) * chosen
+def check_ends(robot: Robot, start_name: str, start: Any, target_name: str, target: Any) -> None:
+    """Starts and targets, one or many, that the robot can hold.
 
-
-def step(
-    robot: Robot,
-    displacements: Float[Array, "*n SJ"],
-    move: Float[Array, "*n SJ"],
-    repositions: Float[Array, "*n"],
-    engages: Float[Array, "*n"],
-    goal: Float[Array, "*#n S"],
-) -> Transition:
-    """The one transition rule: reposition and engage as needed, then move the tendons.
-
-    Args:
-        robot: The arm.
-        displacements: Before the step [m].
-        move: Displacement of each tendon [m].
-        repositions: 1 where the axial motor moves first, else 0.
-        engages: 1 where clutches engage at the position where the drum already stands, else 0.
-        goal: Bending angles of the target [rad].
+    Raises:
+        ValueError: See ``check_problem``.
     """
-    return Transition(
-        before=displacements,
-        after=displacements + move,
-        repositions=repositions,
-        wait=repositions * robot.switch_time + engages * robot.engage_time,
-        goal=goal,
-    )
+    check_displacements(robot, start_name, start)
+    check_displacements(robot, target_name, target)
+    bent = configuration_from_tendons(robot, target)
+    if not np.isfinite(bent).all():
+        raise ValueError(f"{target_name}: tendons are wound in by more than a segment's length")
+    try:
+        check_configuration(robot, bent)
+    except ValueError as error:
+        raise ValueError(f"{target_name}: {error}") from None
 
 
-def transition_cost(
-    robot: Robot,
-    terms: tuple[tuple[str, Term], ...],
-    weights: Float[Array, " T"],
-    transition: Transition,
-) -> Float[Array, "*n"]:
-    """Weighted sum of the terms over one transition."""
-    return sum(
-        (weights[i] * term(robot, transition) for i, (_, term) in enumerate(terms)),
-        start=jnp.zeros_like(transition.repositions),
-    )
+def _check_clear(robot: Robot, problem: Problem, world: World) -> None:
+    for name in ("start", "target"):
+        q = configuration_from_tendons(robot, getattr(problem, name))
+        with jax.enable_x64(True):
+            distance = float(clearance(robot, q, world))
+        if not distance >= 0.0:
+            raise ValueError(
+                f"Problem.{name}: the arm is {-1e3 * distance:.3g} mm deep in an obstacle or itself"
+            )

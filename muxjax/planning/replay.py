@@ -15,10 +15,10 @@ from muxjax.planning.problem import Plan
 
 @dataclass(frozen=True)
 class Step:
-    """One chosen action: the stop, and the tendons that move there."""
+    """One chosen action: the stop, and the steps that each tendon moves there."""
 
     stop: int
-    moves: Bool[np.ndarray, " SJ"]
+    moves: Int[np.ndarray, " SJ"]
 
 
 def replay(
@@ -52,15 +52,17 @@ def replay(
     if remaining[-1].any() or off > lattice.problem.tolerance * (1 + 1e-9):
         raise AssertionError(f"{method}: the plan ends {off:g} m from the target")
     own = lattice.axial_of(np.array([s.stop for s in steps], dtype=np.int64))
-    both = lattice.costs(remaining[:-1], moved > 0)
-    both[:1] = lattice.costs(remaining[:-1][:1], moved[:1] > 0, first=True)
+    both = _costs(lattice, remaining[:-1], moved, expensive=False)
+    with_obstacles = both + _costs(lattice, remaining[:-1], moved, expensive=True)
     cost, axial = min(
-        ((_cost(lattice, both, axial), axial) for axial in (own, _fewest(lattice, moved > 0, own))),
+        (
+            (_cost(lattice, with_obstacles, axial), axial)
+            for axial in (own, _fewest(lattice, moved > 0, own))
+        ),
         key=lambda priced: priced[0],
     )
     if not np.isfinite(cost):
-        reason = "it passes through a state that is not defined, or whose cost is not finite"
-        return failed(lattice, method=method, reason=reason, expansions=expansions)
+        return failed(lattice, method=method, reason=_why(lattice, both), expansions=expansions)
     if lower_bound is None:
         lower_bound = float(AdmissibleBound(lattice)(*_start(lattice))[0])
     return Plan(
@@ -73,7 +75,27 @@ def replay(
         fingerprint=lattice.robot.fingerprint,
         method=method,
         status="optimal" if optimal else "feasible",
+        action_set=lattice.problem.action_set,
     )
+
+
+def _costs(
+    lattice: Lattice,
+    remaining: Int[np.ndarray, "K SJ"],
+    moved: Int[np.ndarray, "K SJ"],
+    *,
+    expensive: bool,
+) -> Float[np.ndarray, "K 2"]:
+    """Cost of every step, without and with a repositioning before it."""
+    both = lattice.costs(remaining, moved, expensive=expensive)
+    both[:1] = lattice.costs(remaining[:1], moved[:1], first=True, expensive=expensive)
+    return both
+
+
+def _why(lattice: Lattice, both: Float[np.ndarray, "K 2"]) -> str:
+    if lattice.problem.world is not None and np.isfinite(both).all():
+        return "it passes through a collision"
+    return "it passes through a state that is not defined, or whose cost is not finite"
 
 
 def _cost(lattice: Lattice, both: Float[np.ndarray, "K 2"], axial: Int[np.ndarray, " K"]) -> float:
@@ -102,6 +124,7 @@ def failed(lattice: Lattice, *, method: str, reason: str, expansions: int) -> Pl
         method=method,
         status="failed",
         reason=reason,
+        action_set=lattice.problem.action_set,
     )
 
 

@@ -1,6 +1,9 @@
 """Planners side by side: gap to the certified optimum, states expanded, CPU time.
 
-    python -m tests.benchmarks.planning [targets]
+    python -m tests.benchmarks.planning [targets] [methods|lattices|batch ...]
+
+"methods" compares every planner where the exact one fits, "lattices" the layered beam on lattices
+from coarse to fine and for two robots, "batch" counts full-move optima a second.
 
 Targets as MODEL.md section 7 fixes them: bending uniform in 0.2-1.6 rad, azimuth uniform, seed 0,
 from the straight arm; weights of the preset "paper".
@@ -39,8 +42,80 @@ def timed_plan(
 
 
 def main() -> None:
-    """Measure and print a table."""
-    robot, n = muxjax.load_robot("muxarm"), int(sys.argv[1]) if len(sys.argv) > 1 else 50
+    """Measure and print tables."""
+    n = int(sys.argv[1]) if len(sys.argv) > 1 else 50
+    parts = sys.argv[2:] or ["methods", "lattices", "batch"]
+    print(f"{machine()}; {n} targets, seed 0; median (quartiles); compilation is left out\n")
+    for part in parts:
+        print({"methods": methods, "lattices": lattices, "batch": batch}[part](n), "\n")
+
+
+def lattices(n: int) -> str:
+    """The layered beam, B = 64, against lattice size."""
+    rows = []
+    for name in ("muxarm", "penta"):
+        robot = muxjax.load_robot(name)
+        goals = targets(robot, n)
+        servo_sets = SERVO_SETS if name == "muxarm" else ((1,), (1, 2, 3, 4))
+        for max_step in (0.03, 0.01, 0.005, 0.003, 0.002):
+            for servos in servo_sets:
+                problems = [
+                    muxjax.Problem(0 * goal, goal, servos=servos, max_step=max_step)
+                    for goal in goals
+                ]
+                muxjax.plan(robot, problems[0], "beamstep")
+                began = time.perf_counter()
+                runs = [timed_plan(robot, problem, "beamstep") for problem in problems]
+                wall = time.perf_counter() - began
+                expansions = sum(found.expansions for found, _ in runs)
+                cpu = [milliseconds for _, milliseconds in runs]
+                rows.append(
+                    [
+                        name,
+                        f"{1e3 * max_step:g} mm",
+                        str(len(servos)),
+                        quartiles([100 * found.gap for found, _ in runs]),
+                        quartiles(cpu),
+                        f"{1e3 * wall / n:.0f}",
+                        f"{1e3 * expansions / sum(cpu):.0f}",
+                    ]
+                )
+    header = [
+        "robot",
+        "step",
+        "servos",
+        "certified gap [%]",
+        "CPU [ms]",
+        "wall [ms]",
+        "expansions/s",
+    ]
+    return table(header, rows)
+
+
+def batch(n: int) -> str:
+    """Full-move optima a second, for batches of 40 n problems."""
+    robot = muxjax.load_robot("muxarm")
+    goals, rows = targets(robot, 40 * n), []
+    for preset in ("paper", "fastest", "no-overshoot"):
+        muxjax.planning.plan_batch(robot, np.zeros(9), goals[:1], preset=preset)
+        for servos in SERVO_SETS:
+            cpu, wall = time.process_time(), time.perf_counter()
+            muxjax.planning.plan_batch(robot, np.zeros(9), goals, preset=preset, servos=servos)
+            cpu, wall = time.process_time() - cpu, time.perf_counter() - wall
+            rows.append(
+                [
+                    preset,
+                    str(len(servos)),
+                    f"{1e3 * cpu / len(goals):.2f}",
+                    f"{len(goals) / wall:.0f}",
+                ]
+            )
+    return table(["preset", "servos", "CPU a plan [ms]", "plans/s"], rows)
+
+
+def methods(n: int) -> str:
+    """Every planner where the exact one fits."""
+    robot = muxjax.load_robot("muxarm")
     goals = targets(robot, n)
     rows = []
     for max_step in STEPS:
@@ -69,9 +144,6 @@ def main() -> None:
                         quartiles([milliseconds for _, milliseconds in runs]),
                     ]
                 )
-    print(
-        f"{machine()}; {n} targets, seed 0; median (quartiles); the second of two calls is timed\n"
-    )
     header = [
         "step",
         "servos",
@@ -82,7 +154,7 @@ def main() -> None:
         "expanded",
         "CPU [ms]",
     ]
-    print(table(header, rows))
+    return table(header, rows)
 
 
 def quartiles(values: object) -> str:

@@ -1,0 +1,317 @@
+"""The optimum of full moves, compiled: each tendon goes all the way in one step.
+
+A state is the set of unfinished tendons, 2^(S J) of them. What a step costs depends on the state
+and on the tendons that move, not on where the axial motor stands, except through the waiting: so
+legs are priced once, compiled, layer by layer on a product grid, and a dynamic programme over the
+number of unfinished tendons combines them with the axial positions: on the host for one problem,
+compiled for a batch, which is the last axis. Servos, weights, start and target are traced: one
+compilation serves every fault and every target.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from muxjax.planning.grid import layered_angles
+from muxjax.planning.motion import LEG_POINTS
+from muxjax.planning.terms import CostTerm, Transition, transition_cost, waiting_time
+from muxjax.robot import Robot
+
+Array = jax.Array | np.ndarray
+
+MOST_TENDONS = 12
+
+
+def fits(robot: Robot) -> bool:
+    """Whether the states are few, and all servos of an axial position sit on one layer."""
+    layers = robot.axial_map // robot.tendons_per_segment
+    return robot.n_tendons <= MOST_TENDONS and bool((layers == layers[:, :1]).all())
+
+
+class Level(NamedTuple):
+    """Steps from all states with the same number of unfinished tendons, through one layer."""
+
+    edge: Int[Array, "states L"]  # which leg of the layer
+    after: Int[Array, "states L"]  # place of the state after it
+    moved: Int[Array, "states L"]  # its tendons within the layer, as bits
+    here: Int[Array, "states 1"]  # unfinished tendons of the layer, as bits
+    exists: Bool[Array, "states L"]  # the others are padding
+
+
+@dataclass(frozen=True, eq=False)
+class Tables:
+    """What depends on the counts alone. States stand in the order of their unfinished tendons.
+
+    A state's number is read in base 2^J, first layer first; the bits of a digit are the
+    unfinished tendons of that layer.
+    """
+
+    n_segments: int
+    j: int
+    leg_before: Int[np.ndarray, " legs"]  # digits before and after the legs of a layer
+    leg_after: Int[np.ndarray, " legs"]
+    place: Int[np.ndarray, " states"]  # of each state
+    first: Int[np.ndarray, " levels"]  # place of the first state of each level
+    levels: tuple[tuple[Level, ...], ...]  # [level - 1][layer]
+    legs_of: tuple[Level, ...]  # [layer], for every state, by number
+
+
+@lru_cache
+def tables(n_segments: int, j: int) -> Tables:
+    """Tables for S layers of J tendons."""
+    base = 2**j
+    pairs = [(x, y) for x in range(base) for y in range(x) if y & ~x == 0]
+    before, after = (np.array(side) for side in zip(*pairs, strict=True))
+    digits = np.stack(np.unravel_index(np.arange(base**n_segments), (base,) * n_segments), axis=-1)
+    count = np.array([int(d).bit_count() for d in range(base)])[digits].sum(axis=-1)
+    order = np.argsort(count, kind="stable")
+    place = np.argsort(order, kind="stable")
+    legs_of = tuple(_legs(digits, layer, before, after, place) for layer in range(n_segments))
+    levels = []
+    for level in range(1, n_segments * j + 1):
+        rows = order[count[order] == level]
+        widest = max(int(table.exists[rows].sum(axis=1).max()) for table in legs_of)
+        levels.append(
+            tuple(
+                Level(*(a[rows, : a.shape[1] if a.shape[1] == 1 else widest] for a in table))
+                for table in legs_of
+            )
+        )
+    first = np.searchsorted(count[order], np.arange(n_segments * j + 2))
+    return Tables(n_segments, j, before, after, place, first, tuple(levels), legs_of)
+
+
+def _legs(
+    digits: Int[np.ndarray, "states S"],
+    layer: int,
+    before: Int[np.ndarray, " legs"],
+    after: Int[np.ndarray, " legs"],
+    place: Int[np.ndarray, " states"],
+) -> Level:
+    """Every state's legs through one layer."""
+    n_states, n_segments = digits.shape
+    base, widest = int(before.max()) + 1, int(before.max())
+    edge, then, moved = (np.zeros((n_states, widest), dtype=np.int64) for _ in range(3))
+    exists = np.zeros((n_states, widest), dtype=bool)
+    shape = [base] * n_segments
+    shape[layer] = len(before)
+    for number, digit in enumerate(digits):
+        for slot, leg in enumerate(np.flatnonzero(before == digit[layer])):
+            through, to = digit.copy(), digit.copy()
+            through[layer], to[layer] = leg, after[leg]
+            edge[number, slot] = np.ravel_multi_index(tuple(through), shape)
+            then[number, slot] = place[np.ravel_multi_index(tuple(to), (base,) * n_segments)]
+            moved[number, slot] = digit[layer] & ~after[leg]
+            exists[number, slot] = True
+    return Level(edge, then, moved, digits[:, layer, None], exists)
+
+
+def number(unfinished: Bool[np.ndarray, "*n SJ"], j: int) -> Int[np.ndarray, "*n"]:
+    """Number of the state in which these tendons are unfinished."""
+    digits = unfinished.reshape(*unfinished.shape[:-1], -1, j) @ (1 << np.arange(j))
+    base = (2**j) ** np.arange(digits.shape[-1])[::-1]
+    return np.asarray(digits @ base)
+
+
+class EdgeCosts(NamedTuple):
+    """Cost of the legs of one layer; the last axis is the batch."""
+
+    stay: Float[Array, "edges batch"]
+    switch: Float[Array, "edges batch"]
+    engage: Float[Array, "edges batch"]  # a first step where the drum already stands
+
+
+@jax.jit
+def edge_costs(
+    robot: Robot,
+    terms: tuple[CostTerm, ...],
+    weights: Float[Array, " T"],
+    start: Float[Array, " SJ"],
+    end: Float[Array, " SJ"],
+    target: Float[Array, " SJ"],
+) -> tuple[tuple[jax.Array, ...], ...]:
+    """Costs of every leg of each layer, as in ``EdgeCosts`` but for the batch."""
+    table = tables(robot.n_segments, robot.tendons_per_segment)
+    bits = (np.arange(2**table.j)[:, None] >> np.arange(table.j)) & 1
+    starts, ends = (x.reshape(table.n_segments, 1, table.j) for x in (start, end))
+    corners = list(jnp.where(bits == 1, starts, ends))
+    at_corners = _whole(layered_angles(robot, corners))
+    goal = jnp.stack([a.reshape(()) for a in layered_angles(robot, [*_rows(robot, target)])])
+    costs = []
+    for layer in range(table.n_segments):
+        begin, finish = (corners[layer][d] for d in (table.leg_before, table.leg_after))
+        fraction = ((np.arange(LEG_POINTS) + 0.5) / LEG_POINTS)[:, None]
+        along = (begin[:, None] + fraction * (finish - begin)[:, None]).reshape(-1, table.j)
+        points = [*corners[:layer], along, *corners[layer + 1 :]]
+        theta_along = _whole(layered_angles(robot, points))
+        shape = list(theta_along.shape)
+        shape[layer : layer + 1] = [len(begin), LEG_POINTS]
+        before, after = (
+            _whole_displacements([*corners[:layer], side, *corners[layer + 1 :]])
+            for side in (begin, finish)
+        )
+        theta_before = jnp.take(at_corners, table.leg_before, axis=layer)
+        theta_after = jnp.take(at_corners, table.leg_after, axis=layer)
+
+        def cost(
+            repositions: float,
+            engages: float,
+            before: Array = before,
+            after: Array = after,
+            theta: tuple[Array, Array, Array] = (
+                theta_before,
+                theta_after,
+                jnp.moveaxis(theta_along.reshape(shape), layer + 1, -2),
+            ),
+        ) -> Array:
+            flags = jnp.full(before.shape[:-1], repositions)
+            wait = waiting_time(robot, flags, jnp.full_like(flags, engages))
+            moved = Transition(before, after, flags, wait, goal, *theta)
+            return transition_cost(robot, terms, weights, moved)
+
+        defined = jnp.all(jnp.isfinite(theta_after), axis=-1)
+        variants = (cost(0.0, 0.0), cost(1.0, 0.0), cost(0.0, 1.0))
+        costs.append(
+            tuple(
+                jnp.where(defined & jnp.isfinite(value), value, jnp.inf).reshape(-1)
+                for value in variants
+            )
+        )
+    return tuple(costs)
+
+
+def _rows(robot: Robot, displacements: Array) -> Array:
+    return displacements.reshape(robot.n_segments, 1, robot.tendons_per_segment)
+
+
+def _whole(angles: list[jax.Array]) -> Array:
+    """Angles by segment on the whole grid, the segment last."""
+    shape = angles[-1].shape
+    return jnp.stack(
+        [
+            jnp.broadcast_to(a.reshape(*a.shape, *(1,) * (len(shape) - a.ndim)), shape)
+            for a in angles
+        ],
+        axis=-1,
+    )
+
+
+def _whole_displacements(points: list[Array]) -> Array:
+    shape = tuple(len(p) for p in points)
+    columns = []
+    for layer, p in enumerate(points):
+        p = p.reshape(*(len(p) if k == layer else 1 for k in range(len(shape))), p.shape[-1])
+        columns.append(jnp.broadcast_to(p, (*shape, p.shape[-1])))
+    return jnp.concatenate(columns, axis=-1)
+
+
+def values(
+    robot: Robot,
+    edges: tuple[EdgeCosts, ...],
+    healthy: Bool[Array, " J"],
+    whole: Bool[Array, ""],
+    xp: Any,
+) -> Float[Array, "states A batch"]:
+    """Cost to go from each state (by place) at each axial position.
+
+    Args:
+        robot: The arm.
+        edges: By layer.
+        healthy: Which servos are available.
+        whole: A step moves all that it reaches and that still has to move; else any subset.
+        xp: ``numpy``, or ``jax.numpy`` in compiled code.
+    """
+    table = tables(robot.n_segments, robot.tendons_per_segment)
+    axials, reach = reach_by_layer(robot, healthy, xp)
+    back = np.argsort(np.concatenate(axials))
+    value = xp.zeros((1, len(robot.axial_map), edges[0].stay.shape[-1]))
+    for level in table.levels:
+        stays, switches = [], []
+        for layer, steps in enumerate(level):
+            after = value[steps.after][:, :, axials[layer]]
+            after = xp.where(allowed(steps, reach[layer], whole)[..., None], after, xp.inf)
+            stays.append(xp.min(edges[layer].stay[steps.edge][:, :, None] + after, axis=1))
+            onwards = edges[layer].switch[steps.edge] + xp.min(after, axis=2)
+            switches.append(xp.min(onwards, axis=1))
+        elsewhere = xp.min(xp.stack(switches), axis=0)
+        stay = xp.concatenate(stays, axis=1)[:, back]
+        value = xp.concatenate([value, xp.minimum(stay, elsewhere[:, None])])
+    return value
+
+
+@jax.jit
+def costs_from_start(
+    robot: Robot,
+    edges: tuple[EdgeCosts, ...],
+    unfinished: Int[Array, " batch"],
+    axial: Int[Array, ""],
+    healthy: Bool[Array, " J"],
+    whole: Bool[Array, ""],
+) -> Float[Array, " batch"]:
+    """Cost of the optimum of each problem of a batch.
+
+    Args:
+        robot: The arm, which ``fits``.
+        edges: Costs of the legs, by layer.
+        unfinished: Number of the start's state.
+        axial: Axial position at the start, counting from 0; -1 where it is not known.
+        healthy: Which servos are available.
+        whole: A step moves all that it reaches and that still has to move; else any subset.
+    """
+    table = tables(robot.n_segments, robot.tendons_per_segment)
+    axials, reach = reach_by_layer(robot, healthy, jnp)
+    value = values(robot, edges, healthy, whole, jnp)
+
+    def one(value: Array, edges: tuple[EdgeCosts, ...], state: Array) -> Array:
+        best = jnp.where(state == 0, 0.0, jnp.inf)
+        for layer, everywhere in enumerate(table.legs_of):
+            steps = Level(*(jnp.asarray(a)[state][None] for a in everywhere))
+            may = allowed(steps, reach[layer], whole)[0]
+            after = value[steps.after[0]][:, axials[layer]]
+            _, switch, engage = (c[steps.edge[0]][:, None] for c in edges[layer])
+            # The first step may engage without repositioning.
+            through = jnp.where(axials[layer] == axial, engage, switch) + after
+            best = jnp.minimum(best, jnp.min(jnp.where(may, through, jnp.inf)))
+        return best
+
+    return jax.vmap(one, in_axes=(-1, -1, 0))(value, edges, unfinished)
+
+
+@jax.jit
+def batch_edge_costs(
+    robot: Robot,
+    terms: tuple[CostTerm, ...],
+    weights: Float[Array, " T"],
+    starts: Float[Array, "batch SJ"],
+    ends: Float[Array, "batch SJ"],
+    targets: Float[Array, "batch SJ"],
+) -> tuple[EdgeCosts, ...]:
+    """``edge_costs`` of many problems."""
+    price = jax.vmap(edge_costs, in_axes=(None, None, None, 0, 0, 0), out_axes=-1)
+    return tuple(EdgeCosts(*c) for c in price(robot, terms, weights, starts, ends, targets))
+
+
+def reach_by_layer(
+    robot: Robot, healthy: Bool[Array, " J"], xp: Any
+) -> tuple[list[np.ndarray], list[Int[Array, " a"]]]:
+    """Axial positions at each layer, and the tendons met there by healthy servos, as bits."""
+    layer_of, within = np.divmod(robot.axial_map, robot.tendons_per_segment)
+    bits = xp.sum(xp.where(healthy, 1 << within, 0), axis=1)
+    axials = [np.flatnonzero(layer_of[:, 0] == layer) for layer in range(robot.n_segments)]
+    return axials, [bits[a] for a in axials]
+
+
+def allowed(
+    steps: Level, reach: Int[Array, " a"], whole: Bool[Array, ""]
+) -> Bool[Array, "states L a"]:
+    """Which steps may be taken from which of the layer's axial positions."""
+    moved, here = steps.moved[..., None], steps.here[..., None]
+    all_of_it, some = moved == (reach & here), (moved & ~reach) == 0
+    return steps.exists[..., None] & ((whole & all_of_it) | (~whole & some))

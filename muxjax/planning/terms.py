@@ -1,0 +1,180 @@
+"""One step of the arm, and what it costs: a weighted sum of named terms (M Eq. 8, 14-15).
+
+A term is a function ``term(robot, transition)`` of any batch of transitions, none may be negative,
+and one that is not finite forbids its step. A term that needs data of its own (a world, a chain, a
+fitted surrogate) is an ``equinox.Module`` with that method as ``__call__``: its arrays are traced,
+so that other data of the same shapes need no other compilation.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from muxjax.planning.motion import angles_along, bending_angles, leg_time, relative_excess
+from muxjax.robot import Robot
+
+Array = jax.Array | np.ndarray
+
+
+class Transition(NamedTuple):
+    """One step of the arm, as cost terms see it. Any leading batch axes."""
+
+    before: Float[Array, "*n SJ"]  # displacements [m]
+    after: Float[Array, "*n SJ"]  # [m]
+    repositions: Float[Array, "*n"]  # 1 where the axial motor moves first, else 0
+    wait: Float[Array, "*n"]  # time spent at `before` until the tendons move [s]: t_sw, or the
+    # engagement alone for a first step at the axial position where the drum stands, or 0
+    goal: Float[Array, "*#n S"]  # bending angles of the target [rad]
+    theta_before: Float[Array, "*n S"]  # bending angles [rad]
+    theta_after: Float[Array, "*n S"]
+    theta_along: Float[Array, "*n points S"]  # at the midpoints of 8 equal parts of the leg
+
+
+Term = Callable[[Robot, Transition], Float[Array, "*n"]]
+
+
+def travel(robot: Robot, t: Transition) -> Float[Array, "*n"]:
+    """Sum of |dl| [m] (M Eq. 8)."""
+    return jnp.sum(jnp.abs(t.after - t.before), axis=-1)
+
+
+def bending(robot: Robot, t: Transition) -> Float[Array, "*n"]:
+    """|theta(l^k)|^2 [rad^2] at the end of the step (M Eq. 8)."""
+    return jnp.sum(t.theta_after**2, axis=-1)
+
+
+def switches(robot: Robot, t: Transition) -> Float[Array, "*n"]:
+    """Axial repositionings, the first one included (M Eq. 8)."""
+    return t.repositions
+
+
+def time(robot: Robot, t: Transition) -> Float[Array, "*n"]:
+    """Execution time [s] (M Eq. 14)."""
+    return t.wait + leg_time(robot, t.after - t.before)
+
+
+def overshoot(robot: Robot, t: Transition) -> Float[Array, "*n"]:
+    """Relative overshoot integrated over waiting and motion [s] (M Eq. 15, made additive)."""
+    along = jnp.mean(relative_excess(t.theta_along, t.goal[..., None, :]), axis=-1)
+    waiting = t.wait * relative_excess(t.theta_before, t.goal)
+    return waiting + leg_time(robot, t.after - t.before) * along
+
+
+def overshoot_peak(robot: Robot, t: Transition) -> Float[Array, "*n"]:
+    """Greatest relative overshoot on the leg, all segments together; the sum over legs counts.
+
+    The peak of a whole plan (M Eq. 15b) is a maximum and does not add up. The sum over legs does;
+    at the points looked at (8 on a leg, and its end) it is never below the maximum, and both are
+    zero together.
+    """
+    along = jnp.max(relative_excess(t.theta_along, t.goal[..., None, :]), axis=-1)
+    return jnp.maximum(along, relative_excess(t.theta_after, t.goal))
+
+
+TERMS: Mapping[str, Term] = {
+    "travel": travel,
+    "bending": bending,
+    "switches": switches,
+    "time": time,
+    "overshoot": overshoot,
+    "overshoot_peak": overshoot_peak,
+}
+
+
+@dataclass(frozen=True, eq=False)
+class ByIdentity:
+    """A term with arrays of its own, hashable: equal only to itself."""
+
+    term: Term
+
+    def __call__(self, robot: Robot, t: Transition) -> Float[Array, "*n"]:
+        """The term's value."""
+        return self.term(robot, t)
+
+
+class CostTerm(eqx.Module):
+    """A term in a form that compiled functions take: arrays traced, all else static."""
+
+    arrays: Any
+    rest: Any = eqx.field(static=True)
+
+    def __call__(self, robot: Robot, t: Transition) -> Float[Array, "*n"]:
+        """The term's value."""
+        return eqx.combine(self.arrays, self.rest)(robot, t)
+
+
+def cost_term(term: Term) -> CostTerm:
+    """Separate what is traced in a term from what selects the compiled code."""
+    return CostTerm(*eqx.partition(term, _is_traced))
+
+
+def _is_traced(leaf: object) -> bool:
+    return isinstance(leaf, (jax.Array, np.ndarray, np.generic, float))
+
+
+def is_expensive(term: Term) -> bool:
+    """Whether planners should ask a term only about steps that they would otherwise take.
+
+    Such a term says so by an attribute ``expensive = True``. Nothing is lost: no term is negative,
+    so until it is asked it counts as zero, which is a lower bound.
+    """
+    return bool(getattr(term, "expensive", False))
+
+
+def step(
+    robot: Robot,
+    displacements: Float[Array, "*n SJ"],
+    move: Float[Array, "*n SJ"],
+    repositions: Float[Array, "*n"],
+    engages: Float[Array, "*n"],
+    goal: Float[Array, "*#n S"],
+) -> Transition:
+    """The one transition rule: reposition and engage as needed, then move the tendons.
+
+    Args:
+        robot: The arm.
+        displacements: Before the step [m].
+        move: Displacement of each tendon [m].
+        repositions: 1 where the axial motor moves first, else 0.
+        engages: 1 where clutches engage at the position where the drum already stands, else 0.
+        goal: Bending angles of the target [rad].
+    """
+    after = displacements + move
+    return Transition(
+        before=displacements,
+        after=after,
+        repositions=repositions,
+        wait=waiting_time(robot, repositions, engages),
+        goal=goal,
+        theta_before=bending_angles(robot, displacements),
+        theta_after=bending_angles(robot, after),
+        theta_along=angles_along(robot, displacements, after),
+    )
+
+
+def waiting_time(
+    robot: Robot, repositions: Float[Array, "*n"], engages: Float[Array, "*n"]
+) -> Float[Array, "*n"]:
+    """Seconds until the tendons move (M Eq. 14's t_sw; less where the drum need not turn)."""
+    return repositions * robot.switch_time + engages * robot.engage_time
+
+
+def transition_cost(
+    robot: Robot,
+    terms: tuple[Term, ...],
+    weights: Float[Array, " T"],
+    transition: Transition,
+) -> Float[Array, "*n"]:
+    """Weighted sum of the terms over one transition."""
+    return sum(
+        (weights[i] * term(robot, transition) for i, term in enumerate(terms)),
+        start=jnp.zeros_like(transition.repositions),
+    )

@@ -19,16 +19,30 @@ from muxjax.metrics import Metrics, evaluate
 from muxjax.planning import Plan, PlanningError, Problem, plan
 from muxjax.robot import Robot, load_robot
 from muxjax.scheduler import Instruction, Program, schedule
+from muxjax.statics import (
+    ElasticChain,
+    Equilibrium,
+    InverseResult,
+    StaticsError,
+    StaticsStatus,
+    elastic_chain,
+    forward_statics,
+    inverse_statics,
+    load_chain,
+)
 from muxjax.tendons import configuration_from_tendons, tendon_displacements
 from muxjax.workspace import load_sweep, sweep
 
 __all__ = [
     "AllIkResult",
     "ConfigError",
+    "ElasticChain",
+    "Equilibrium",
     "IkError",
     "IkResult",
     "IkStatus",
     "Instruction",
+    "InverseResult",
     "LockstepLink",
     "Metrics",
     "PathResult",
@@ -38,16 +52,22 @@ __all__ = [
     "Program",
     "Robot",
     "Run",
+    "StaticsError",
+    "StaticsStatus",
     "World",
     "all_ik",
     "attach_derivatives",
     "backbone",
     "clearance",
     "configuration_from_tendons",
+    "elastic_chain",
     "evaluate",
     "execute",
     "forward_kinematics",
+    "forward_statics",
+    "inverse_statics",
     "jacobian",
+    "load_chain",
     "load_robot",
     "load_sweep",
     "load_world",

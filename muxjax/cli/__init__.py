@@ -1,4 +1,4 @@
-"""The command line: ``muxjax demo | fk | ik | plan | run | sweep``.
+"""The command line: ``muxjax bench | demo | fk | ik | plan | run | sweep | statics | task``.
 
 A person types and reads millimetres and degrees; ``--json`` prints SI units for a machine. The exit
 code is 0 on success, 1 where a pose was not reached or a run did not complete, 2 on bad input.
@@ -16,20 +16,26 @@ from typing import Any
 import jax
 import tyro
 
+from muxjax.cli.bench import bench
 from muxjax.cli.demo import demo
 from muxjax.cli.plans import plan, run
 from muxjax.cli.poses import fk, ik
+from muxjax.cli.statics import statics
 from muxjax.cli.sweep import sweep
+from muxjax.cli.task import task
 from muxjax.ik import IkError
 from muxjax.planning import PlanningError
 
 COMMANDS: dict[str, Callable[..., Any]] = {
+    "bench": bench,
     "demo": demo,
     "fk": fk,
     "ik": ik,
     "plan": plan,
     "run": run,
     "sweep": sweep,
+    "statics": statics,
+    "task": task,
 }
 
 

@@ -1,0 +1,251 @@
+"""Arms, and tendon lengths and bending angles of programs over time."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import matplotlib as mpl
+import numpy as np
+from jaxtyping import Float
+from matplotlib.animation import FuncAnimation, PillowWriter
+from matplotlib.figure import Figure
+
+from muxjax.kinematics import backbone
+from muxjax.metrics import Timeline, timeline
+from muxjax.planning.motion import angles_at
+from muxjax.robot import Robot
+from muxjax.scheduler import Program
+from muxjax.tendons import configuration_from_tendons
+
+# Okabe-Ito colours by segment, distinguishable without colour vision and, with the line styles
+# by tendon, in grey print.
+SEGMENT_COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
+TENDON_STYLES = ("-", "--", ":", "-.")
+_POINTS_A_SEGMENT = 24
+_PANELS_A_ROW = 4
+_FRAMES_A_SECOND = 10
+
+
+def colour(segment: int) -> str:
+    """Colour of a segment, counting from 0."""
+    return SEGMENT_COLOURS[segment % len(SEGMENT_COLOURS)]
+
+
+def style(tendon: int) -> str:
+    """Line style of a tendon within its segment, counting from 0."""
+    return TENDON_STYLES[tendon % len(TENDON_STYLES)]
+
+
+def compare_programs(
+    robot: Robot, programs: Mapping[str, Program], title: str, path: str | Path
+) -> Path:
+    """Tendon displacements and bending angles over time, a panel a program (after M Fig. 6).
+
+    Shaded stretches are motion, blank ones repositioning; dotted lines are the final angles.
+
+    Args:
+        robot: The arm.
+        programs: By the name that heads their panel.
+        title: Above the figure.
+        path: Image to write; the ending chooses the format.
+    """
+    columns = min(len(programs), _PANELS_A_ROW)
+    bands = -(-len(programs) // columns)
+    figure = Figure(figsize=(2.8 * columns + 5.4, 4.9 * bands + 0.7), layout="constrained")
+    figure.suptitle(title)
+    # The second column is left empty: the arm's axis labels reach into it.
+    grid = figure.add_gridspec(2 * bands, columns + 2, width_ratios=[1.8, 0.3, *[1] * columns])
+    arm = figure.add_subplot(grid[:, 0], projection="3d")
+    first = next(iter(programs.values()))
+    draw_arm(arm, robot, np.array(first.start), alpha=0.35)
+    draw_arm(arm, robot, np.array(first.target))
+    _frame_arm(arm, robot)
+    arm.set_title("start (pale) and target", fontsize=9)
+    top: list[Any] = []
+    for number, (name, program) in enumerate(programs.items()):
+        band, column = divmod(number, columns)
+        lengths = figure.add_subplot(grid[2 * band, column + 2], sharey=top[0] if top else None)
+        angles = figure.add_subplot(
+            grid[2 * band + 1, column + 2], sharex=lengths, sharey=top[1] if top else None
+        )
+        top = top or [lengths, angles]
+        line = timeline(robot, program)
+        _draw_lengths(lengths, robot, line)
+        _draw_angles(angles, robot, line)
+        lengths.set_title(
+            f"{name}\n{line.times[-1]:.1f} s, {len(program.instructions)} stages", fontsize=9
+        )
+        for axes in (lengths, angles):
+            _shade_motion(axes, line)
+            axes.grid(alpha=0.3)
+            axes.tick_params(labelsize=8, labelleft=column == 0)
+        lengths.tick_params(labelbottom=False)
+        angles.set_xlabel("time [s]", fontsize=9)
+        if column == 0:
+            lengths.set_ylabel("tendon displacement [mm]", fontsize=9)
+            angles.set_ylabel("bending angle [deg]", fontsize=9)
+    figure.legend(*_legend(robot), loc="outside lower center", ncols=8, fontsize=8)
+    return _save(figure, path)
+
+
+def _draw_lengths(axes: Any, robot: Robot, line: Timeline) -> None:
+    for c, values in enumerate(line.displacements.T):
+        segment, tendon = divmod(c, robot.tendons_per_segment)
+        axes.plot(line.times, 1e3 * values, style(tendon), color=colour(segment), lw=1.2)
+
+
+def _draw_angles(axes: Any, robot: Robot, line: Timeline) -> None:
+    times = np.union1d(np.linspace(0, line.times[-1], 400), line.times)
+    theta = np.degrees(angles_at(robot, line.at(times)))
+    for segment, values in enumerate(theta.T):
+        axes.plot(times, values, color=colour(segment), lw=1.4)
+        axes.axhline(values[-1], color=colour(segment), ls=":", lw=0.9)
+    axes.set_ylim(bottom=0)
+
+
+def _shade_motion(axes: Any, line: Timeline) -> None:
+    moving = np.any(np.diff(line.displacements, axis=0) != 0, axis=-1)
+    for begin, end in zip(line.times[:-1][moving], line.times[1:][moving], strict=True):
+        axes.axvspan(begin, end, color="0.5", alpha=0.12, lw=0)
+    axes.set_xlim(0, max(line.times[-1], 1e-9))
+
+
+def _legend(robot: Robot) -> tuple[list[Any], list[str]]:
+    segments = [mpl.lines.Line2D([], [], color=colour(i), lw=2) for i in range(robot.n_segments)]
+    tendons = [
+        mpl.lines.Line2D([], [], color="0.3", ls=style(j)) for j in range(robot.tendons_per_segment)
+    ]
+    names = [f"segment {i + 1}" for i in range(robot.n_segments)]
+    return segments + tendons, names + [
+        f"tendon {j + 1} of the segment" for j in range(robot.tendons_per_segment)
+    ]
+
+
+def draw_arm(
+    axes: Any,
+    robot: Robot,
+    displacements: Float[np.ndarray, " SJ"],
+    *,
+    moving: Sequence[int] = (),
+    alpha: float = 1.0,
+) -> None:
+    """Backbone, discs and tendons of the arm on 3-D axes [mm].
+
+    Args:
+        axes: Matplotlib 3-D axes.
+        robot: The arm.
+        displacements: Tendon displacements [m].
+        moving: Tendons, from 0, that are drawn thick.
+        alpha: Opacity.
+    """
+    q = configuration_from_tendons(robot, displacements)
+    frames = backbone(robot, q, _POINTS_A_SEGMENT)
+    points = 1e3 * frames[:, :3, 3]
+    for segment in range(robot.n_segments):
+        part = slice(segment * _POINTS_A_SEGMENT, (segment + 1) * _POINTS_A_SEGMENT + 1)
+        axes.plot(*points[part].T, color=colour(segment), lw=3, alpha=alpha)
+        _draw_discs(axes, robot, q, segment, alpha)
+    for c in range(robot.n_tendons):
+        _draw_tendon(axes, robot, frames, c, thick=c in moving, alpha=alpha)
+
+
+def _draw_discs(axes: Any, robot: Robot, q: Any, segment: int, alpha: float) -> None:
+    n = int(robot.n_discs[segment])
+    discs = backbone(robot, q, n)[segment * n + 1 : (segment + 1) * n + 1]
+    turn = np.linspace(0, 2 * np.pi, 33)
+    rim = float(robot.body_radius) * np.stack([np.cos(turn), np.sin(turn), 0 * turn])
+    for disc in discs:
+        axes.plot(
+            *(1e3 * (disc[:3, :3] @ rim + disc[:3, 3:])), color="0.4", lw=0.5, alpha=0.6 * alpha
+        )
+
+
+def _draw_tendon(
+    axes: Any, robot: Robot, frames: Any, tendon: int, *, thick: bool, alpha: float
+) -> None:
+    segment, j = divmod(tendon, robot.tendons_per_segment)
+    end = (segment + 1) * _POINTS_A_SEGMENT + 1
+    crossed = np.minimum(np.arange(end) // _POINTS_A_SEGMENT, segment)
+    azimuth = robot.tendon_azimuth[crossed, segment, j]
+    holes = float(robot.tendon_radius) * np.stack(
+        [np.cos(azimuth), np.sin(azimuth), 0 * azimuth], axis=-1
+    )
+    path = frames[:end, :3, 3] + np.einsum("pij,pj->pi", frames[:end, :3, :3], holes)
+    axes.plot(
+        *(1e3 * path.T),
+        style(j),
+        color=colour(segment),
+        lw=2.4 if thick else 0.7,
+        alpha=alpha * (1.0 if thick else 0.7),
+    )
+
+
+def _frame_arm(axes: Any, robot: Robot) -> None:
+    reach = 1e3 * float(np.sum(robot.length))
+    # A cube about the middle of the straight arm, wherever its base points.
+    middle = 1e3 * robot.base[:3, 3] + 0.52 * reach * robot.base[:3, 2]
+    half = 0.62 * reach
+    for set_limits, centre in zip(
+        (axes.set_xlim, axes.set_ylim, axes.set_zlim), middle, strict=True
+    ):
+        set_limits(centre - half, centre + half)
+    axes.set_box_aspect((1, 1, 1))
+    axes.set_xlabel("x [mm]", fontsize=8)
+    axes.set_ylabel("y [mm]", fontsize=8)
+    axes.set_zlabel("z [mm]", fontsize=8)
+    axes.tick_params(labelsize=7)
+    axes.view_init(elev=18, azim=-60)
+
+
+def animate(
+    robot: Robot, program: Program, title: str, path: str | Path, *, seconds: float = 4.0
+) -> Path:
+    """The arm executing a program, as an animated GIF.
+
+    Args:
+        robot: The arm.
+        program: What it executes.
+        title: Above the arm.
+        path: File to write, ending in .gif.
+        seconds: Length of the animation; the true time stands in the picture.
+    """
+    line = timeline(robot, program)
+    times = np.linspace(0, line.times[-1], max(2, int(seconds * _FRAMES_A_SECOND)))
+    states = line.at(times)
+    figure = Figure(figsize=(5, 5), layout="constrained")
+    axes = figure.add_subplot(projection="3d")
+
+    def show(k: int) -> list[Any]:
+        axes.clear()
+        moving = [] if k == len(times) - 1 else _moving_at(line, times[k])
+        draw_arm(axes, robot, states[k], moving=moving)
+        _frame_arm(axes, robot)
+        what = (
+            "tendons " + ", ".join(str(c + 1) for c in moving) if len(moving) else "repositioning"
+        )
+        if k == len(times) - 1:
+            what = "done"
+        axes.set_title(f"{title}\n{times[k]:5.1f} of {times[-1]:.1f} s: {what}", fontsize=10)
+        return []
+
+    animation = FuncAnimation(figure, show, frames=len(times), blit=False)
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    animation.save(path, writer=PillowWriter(fps=_FRAMES_A_SECOND), dpi=80)
+    return path
+
+
+def _moving_at(line: Timeline, time: float) -> list[int]:
+    """Tendons, from 0, that move at a time."""
+    stretch = min(int(np.searchsorted(line.times, time, side="right")), len(line.times) - 1)
+    step = line.displacements[stretch] - line.displacements[max(stretch - 1, 0)]
+    return [int(c) for c in np.flatnonzero(step)]
+
+
+def _save(figure: Figure, path: str | Path) -> Path:
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(path, dpi=110)
+    return path

@@ -75,6 +75,137 @@ def test_ik_lists_all_solutions_and_minds_a_world(muxjax):
     assert "no 'moon' among" in err
 
 
+MATRIX = [
+    "0.9063",
+    "0",
+    "0.4226",
+    "0.15225",
+    "0",
+    "1",
+    "0",
+    "0",
+    "-0.4226",
+    "0",
+    "0.9063",
+    "0.413777",
+]
+MATRIX += ["0", "0", "0", "1"]
+
+
+def test_ik_reads_poses_from_any_file(muxjax, tmp_path):
+    named = {"x_mm": 152.25, "y_mm": 0, "z_mm": 413.777}
+    turn = {"qw": 0.97629601, "qx": 0, "qy": 0.21643961, "qz": 0}
+    angles = {"roll_deg": 0, "pitch_deg": 25, "yaw_deg": 0}
+    metres = {"x_m": 0.15225, "y_m": 0.0, "z_m": 0.413777}
+    pose = np.eye(4)
+    pose[:3, 3] = list(metres.values())
+    c, s = np.cos(np.radians(25)), np.sin(np.radians(25))
+    pose[0, [0, 2]], pose[2, [0, 2]] = (c, s), (-s, c)
+    files = {name: tmp_path / name for name in ("a.csv", "b.csv", "c.json", "d.json", "e.npy")}
+    files |= {name: tmp_path / name for name in ("f.npy", "g.txt")}
+    for name, row in (("a.csv", named | turn), ("b.csv", metres | angles)):
+        lines = [",".join(row), *[",".join(map(str, row.values()))] * 2]
+        files[name].write_text("\n".join(lines))
+    files["c.json"].write_text(json.dumps([named | angles, {"matrix": pose.tolist()}]))
+    files["d.json"].write_text(json.dumps({"poses": [pose.tolist()] * 2}))
+    np.save(files["e.npy"], np.stack([pose, pose]))
+    np.save(files["f.npy"], np.array([[*metres.values(), *turn.values()]] * 2))
+    np.savetxt(files["g.txt"], pose)
+    answers = []
+    for name, path in files.items():
+        code, out, err = muxjax("ik", "--poses", str(path), "--json")
+        assert code == 0, (name, err)
+        answers += [row["q"] for row in json.loads(out)]
+    assert len(answers) == 13
+    np.testing.assert_allclose(answers, [answers[0]] * 13, atol=1e-6)
+    code, out, _ = muxjax("ik", "--poses", str(files["a.csv"]))
+    assert code == 0
+    assert "2 of 2 poses reached" in out
+    assert out.count("converged") == 2
+
+
+def test_ik_of_many_poses_fails_if_one_does(muxjax, tmp_path):
+    path = tmp_path / "poses.csv"
+    path.write_text("x_mm,y_mm,z_mm\n0,0,460\n0,100,550\n")
+    code, out, _ = muxjax("ik", "--poses", str(path))
+    assert code == 1
+    assert "1 of 2 poses reached" in out
+    assert "out_of_reach" in out
+
+
+def test_ik_all_tells_which_solutions_are_clear(muxjax):
+    pose = ("ik", "--xyz-mm", "152.25", "0", "413.777", "--rpy-deg", "0", "25", "0")
+    code, out, _ = muxjax(*pose, "--all", "--world", "cabinet", "--json")
+    document = json.loads(out)
+    assert code == (0 if max(document["clearance_m"]) >= 0 else 1)
+    assert len(document["clearance_m"]) == len(document["q"])
+    code, out, _ = muxjax(*pose, "--world", "cabinet", "--prefer", "clearance", "--json")
+    best = json.loads(out)
+    assert best["clearance_m"] == pytest.approx(max(document["clearance_m"]), abs=1e-9)
+    assert best["nearest_segment"] in (1, 2, 3)
+    code, out, _ = muxjax(*pose, "--all", "--world", "cabinet")
+    assert "of them clear" in out
+
+
+def test_ik_goes_near_and_projects_on_request(muxjax):
+    code, out, _ = muxjax("ik", "--matrix", *MATRIX, "--project-rotations", "--json")
+    straightest = json.loads(out)["q"]
+    near = ("--q0-deg", "60", "0", "75", "180", "40", "0")
+    code, out, _ = muxjax("ik", "--matrix", *MATRIX, "--project-rotations", *near, "--json")
+    assert code == 0
+    q = np.degrees(json.loads(out)["q"])
+    np.testing.assert_allclose(q[0::2], [60, 75, 40], atol=1)
+    assert not np.allclose(np.radians(q), straightest, atol=0.1)
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "message"),
+    [
+        ("a.csv", "x_mm,y_mm,z_mm\n1,2,3\n1,2,x\n", "pose 2: z_mm must be a number, found 'x'"),
+        ("a.csv", "x_mm,y_mm,z_mm\n1,2\n", "pose 1: 2 values for 3 columns"),
+        ("a.csv", "x_mm,y_mm\n1,2\n", "pose 1: z_mm is missing beside x_mm"),
+        ("a.csv", "x,y,z\n1,2,3\n", "no column 'x'"),
+        ("a.csv", "x_mm,y_mm,z_mm\n1,2,nan\n", "pose 1: x_mm, y_mm, z_mm must be finite"),
+        ("a.csv", "x_mm,y_mm,z_mm\n", "needs a line of column names and a line a pose"),
+        ("a.csv", "qw,qx,qy,qz\n1,0,0,0\n", "pose 1: needs one position"),
+        ("a.csv", "x_m,y_m,z_m\n0,0,0.4\n0,0,400\n", "a.csv, pose 2: position must be within"),
+        ("a.csv", "x_m,y_m,z_m,qw,qx,qy,qz\n0,0,0.4,2,0,0,0\n", "quaternion has norm 2"),
+        ("a.json", "[[1, 2]]", "pose 1: a matrix must be 16 numbers"),
+        ("a.json", "{", "not readable as JSON"),
+        ("a.json", "[]", "must be a list of poses"),
+        ("a.txt", "1 2\n3 4\n", "must have shape (n, 4, 4) or (n, 7)"),
+        ("a.xlsx", "", "must end in .csv, .json, .npy or .txt"),
+    ],
+)
+def test_bad_pose_files_name_the_row(muxjax, tmp_path, name, text, message):
+    (tmp_path / name).write_text(text)
+    code, out, err = muxjax("ik", "--poses", str(tmp_path / name))
+    assert code == 2
+    assert out == ""
+    assert message in err
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ([], "give one of --xyz-mm, --matrix and --poses"),
+        (["--poses", "nothing.csv"], "nothing.csv: cannot be read"),
+        (["--matrix", "1", "2"], "must be 16 numbers"),
+        (["--matrix", *MATRIX], "pose: not a rotation"),
+        (["--matrix", *MATRIX, "--quat", "1", "0", "0", "0"], "go with --xyz-mm"),
+        (["--xyz-mm", "0", "0", "400", "--all", "--prefer", "bending"], "leave out --q0-deg"),
+        (["--xyz-mm", "0", "0", "400", "--prefer", "clearance"], "'clearance' needs a world"),
+        (["--xyz-mm", "0", "0", "400", "--q0-deg", "1"], "q0: last axis must have 6"),
+    ],
+)
+def test_bad_ik_arguments_are_errors_of_one_line(muxjax, arguments, message):
+    code, out, err = muxjax("ik", *arguments)
+    assert code == 2
+    assert out == ""
+    assert message in err
+    assert len(err.strip().splitlines()) == 1
+
+
 def test_plan_then_run(muxjax, tmp_path):
     path = str(tmp_path / "program.json")
     code, out, _ = muxjax(

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from itertools import combinations, product
+
 import numpy as np
 import pytest
+from scipy.optimize import linprog
 from test_planning import random_targets
 
 import muxjax
-from muxjax.metrics import timeline
+from muxjax.metrics import least_time, timeline, tip_deviation
+from muxjax.metrics.program import _least_layer_time, distance_to_polyline
 from muxjax.planning import Problem, plan
 from muxjax.planning.motion import angles_at
 
@@ -71,3 +75,65 @@ def test_returning_to_straight_has_no_relative_peak(muxarm, rng):
     begin = angles_at(muxarm, start[None])[0]
     assert (np.array(metrics.bending_peak_rad) >= begin - 1e-9).all()
     assert metrics.overshoot_peak_rad == pytest.approx(metrics.bending_peak_rad, abs=1e-6)
+
+
+@pytest.mark.parametrize("servos", [(1,), (1, 2), (1, 2, 3)])
+@pytest.mark.parametrize("axial", [None, 4])
+def test_no_plan_is_faster_than_the_least_time(muxarm, rng, servos, axial):
+    for target in random_targets(muxarm, rng, 4):
+        for max_step in (0.03, None):
+            problem = Problem(
+                np.zeros(9),
+                target,
+                servos=servos,
+                axial=axial,
+                max_step=max_step,
+                weights={"time": 1.0},
+            )
+            program = muxjax.schedule(muxarm, plan(muxarm, problem))
+            bound = least_time(muxarm, program)
+            time = muxjax.evaluate(muxarm, program).time_s
+            assert bound <= time * (1 + 1e-12)
+            assert bound > 0.8 * time
+            if axial is None and len(servos) != 2:
+                assert bound == pytest.approx(time, rel=1e-9)  # it is attained
+
+
+def test_least_time_of_two_visits_against_every_way_of_sharing(rng):
+    """Linear programmes over which tendons move in which of the visits."""
+    for _ in range(20):
+        net = np.sort(rng.uniform(0.1, 9, 3))[::-1]
+        pairs = list(combinations(range(3), 2))
+        best = np.inf
+        for visits in (2, 3):
+            for chosen in product(pairs, repeat=visits):
+                met = np.array([[c in pair for pair in chosen] for c in range(3)], dtype=float)
+                if met.any(axis=1).all():
+                    found = linprog(np.ones(visits), A_ub=-met, b_ub=-net)
+                    best = min(best, 3.0 * visits + found.fun)
+        assert _least_layer_time(net, 2, 3.0) == pytest.approx(best, rel=1e-7)
+
+
+def test_tip_deviation_is_what_a_dense_look_finds(muxarm, rng):
+    target = random_targets(muxarm, rng, 1)[0]
+    program = muxjax.schedule(muxarm, plan(muxarm, Problem(np.zeros(9), target, servos=(1, 2))))
+    line = timeline(muxarm, program)
+    states = line.at(np.linspace(0, line.times[-1], 5001))
+    poses = muxjax.forward_kinematics(muxarm, muxjax.configuration_from_tendons(muxarm, states))
+    tips = poses[:, :3, 3]
+    along = (tips[-1] - tips[0]) / np.linalg.norm(tips[-1] - tips[0])
+    share = (tips - tips[0]) @ along
+    beside = np.linalg.norm(tips - tips[0] - share[:, None] * along, axis=1)
+    length = np.linalg.norm(tips[-1] - tips[0])
+    past = np.maximum(np.maximum(-share, share - length), 0)
+    dense = np.hypot(beside, past).max()
+    assert tip_deviation(muxarm, program) == pytest.approx(dense, abs=2e-4)
+    assert tip_deviation(muxarm, program, tips) < 1e-4  # along its own path
+    with pytest.raises(ValueError, match="path: needs at least two points"):
+        tip_deviation(muxarm, program, tips[:1])
+
+
+def test_distance_to_a_corner_and_a_repeated_point():
+    corners = np.array([[0.0, 0, 0], [1, 0, 0], [1, 0, 0], [1, 1, 0]])
+    points = np.array([[0.5, -0.2, 0], [2.0, 0, 0], [1, 0.5, 0.3], [-3, 4, 0]])
+    assert distance_to_polyline(points, corners) == pytest.approx([0.2, 1.0, 0.3, 5.0])

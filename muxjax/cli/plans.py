@@ -13,11 +13,12 @@ from rich.table import Table
 
 from muxjax.cli.output import console, print_json, row_of
 from muxjax.cli.poses import Quaternion, Xyz, pose_argument
+from muxjax.config import TaskConfig, load_yaml, resolve
 from muxjax.hardware import LockstepLink, execute
 from muxjax.kinematics import check_configuration
 from muxjax.metrics import evaluate
-from muxjax.pipeline import problem_for_pose
-from muxjax.planning import Problem
+from muxjax.pipeline import PathPlan, PosePlan, plan_task, plan_to_pose
+from muxjax.planning import Plan, Problem
 from muxjax.planning import plan as plan_steps
 from muxjax.program_file import load_program, save_program
 from muxjax.robot import Robot, load_robot
@@ -32,6 +33,7 @@ def plan(
     rpy_deg: Xyz | None = None,
     quat: Quaternion | None = None,
     q_deg: tuple[float, ...] | None = None,
+    poses: str | None = None,
     servos: tuple[int, ...] | None = None,
     method: Method = "exact",
     preset: str = "paper",
@@ -40,7 +42,9 @@ def plan(
     out: Path | None = None,
     json: bool = False,
 ) -> int:
-    """Plan from the straight arm to a pose or a configuration.
+    """Plan from the straight arm to a pose, to a configuration, or through several poses.
+
+    A pose is reached by the configuration whose plan costs least.
 
     Example: muxjax plan --q-deg 60 0 75 180 40 0 --servos 1 2 --out program.json
 
@@ -49,6 +53,7 @@ def plan(
         rpy_deg: Roll, pitch, yaw [degrees]; upright by default.
         quat: Orientation as a quaternion w x y z instead.
         q_deg: Bending angle and azimuth of each segment [degrees], instead of a pose.
+        poses: Shipped task or path of a YAML file, whose targets are passed in order, instead.
         servos: Available servos; all by default.
         method: Planner.
         preset: Weights of the cost: paper, fastest, no-overshoot, or a YAML file.
@@ -63,27 +68,54 @@ def plan(
         "preset": preset,
         "max_step": None if max_step_mm is None else max_step_mm / 1e3,
     }
-    problem = _problem(arm, xyz_mm, rpy_deg, quat, q_deg, fields)
-    found = plan_steps(arm, problem, method)
+    if [xyz_mm, q_deg, poses].count(None) != 2:
+        raise ValueError("plan: give either --xyz-mm (a pose), --q-deg or --poses")
+    if xyz_mm is None and (rpy_deg is not None or quat is not None):
+        raise ValueError("plan: only --xyz-mm takes --rpy-deg or --quat")
+    if poses is not None:
+        task = load_yaml(TaskConfig, resolve(poses, "tasks"))
+        return _report_path(arm, task, plan_task(arm, task, method=method, **fields), out, json)
+    choice = None
+    if xyz_mm is not None:
+        pose = pose_argument(xyz_mm, rpy_deg, quat)
+        choice = plan_to_pose(arm, pose, method=method, **fields)
+        found = choice.plan
+    else:
+        q = check_configuration(arm, np.radians(np.asarray(q_deg)))
+        problem = Problem(np.zeros(arm.n_tendons), tendon_displacements(arm, q), **fields)
+        found = plan_steps(arm, problem, method)
+    return _report_plan(arm, found, choice, out, json)
+
+
+def _report_plan(
+    arm: Robot, found: Plan, choice: PosePlan | None, out: Path | None, json: bool
+) -> int:
     program = schedule(arm, found)
     metrics = evaluate(arm, program)
     if out is not None:
         save_program(program, out)
     if json:
-        print_json(
-            {
-                "robot": arm.config.name,
-                "method": found.method,
-                "status": found.status,
-                "cost": found.cost,
-                "lower_bound": found.lower_bound,
-                "gap": found.gap,
-                "metrics": dataclasses.asdict(metrics),
-                "program": dataclasses.asdict(program),
-            }
-        )
+        document = {
+            "robot": arm.config.name,
+            "method": found.method,
+            "status": found.status,
+            "cost": found.cost,
+            "lower_bound": found.lower_bound,
+            "gap": found.gap,
+            "metrics": dataclasses.asdict(metrics),
+            "program": dataclasses.asdict(program),
+        }
+        if choice is not None:
+            document["configurations"] = [
+                {"q": o.q, "cost": o.cost, "lower_bound": o.lower_bound, "refusal": o.refusal}
+                for o in (choice.chosen, *choice.alternatives)
+            ]
+            document["all_configurations"] = choice.complete
+        print_json(document)
         return 0
     _print_program(program)
+    if choice is not None:
+        _print_choice(choice)
     console.print(
         f"{found.method}: {found.status}, cost {found.cost:.6g}, within {100 * found.gap:.2g} % "
         f"of the optimum; {metrics.time_s:.1f} s in {metrics.stages} stages; overshoot peak "
@@ -94,22 +126,57 @@ def plan(
     return 0
 
 
-def _problem(
-    arm: Robot,
-    xyz_mm: Xyz | None,
-    rpy_deg: Xyz | None,
-    quat: Quaternion | None,
-    q_deg: tuple[float, ...] | None,
-    fields: dict[str, Any],
-) -> Problem:
-    if q_deg is not None and (rpy_deg is not None or quat is not None):
-        raise ValueError("plan: --q-deg fixes the orientation; leave out --rpy-deg and --quat")
-    if xyz_mm is not None and q_deg is None:
-        return problem_for_pose(arm, pose_argument(xyz_mm, rpy_deg, quat), **fields)[1]
-    if q_deg is not None and xyz_mm is None:
-        q = check_configuration(arm, np.radians(q_deg))
-        return Problem(np.zeros(arm.n_tendons), tendon_displacements(arm, q), **fields)
-    raise ValueError("plan: give either --xyz-mm (a pose) or --q-deg (a configuration)")
+def _print_choice(choice: PosePlan) -> None:
+    table = Table("bending and azimuth of each segment [deg]", "cost", "")
+    for option in (choice.chosen, *choice.alternatives):
+        pairs = np.degrees(option.q).reshape(-1, 2)
+        cost = f"{option.cost:.6g}"
+        remark = "chosen" if option is choice.chosen else option.refusal
+        if option.plan is None and not option.refusal:
+            cost, remark = f"at least {option.lower_bound:.6g}", "not planned"
+        table.add_row("   ".join(f"{t:.2f} at {p:.2f}" for t, p in pairs), cost, remark)
+    console.print(table)
+
+
+def _report_path(
+    arm: Robot, task: TaskConfig, found: PathPlan, out: Path | None, json: bool
+) -> int:
+    metrics = [evaluate(arm, program) for program in found.programs]
+    whole = evaluate(arm, found.program)
+    if out is not None:
+        save_program(found.program, out)
+    if json:
+        print_json(
+            {
+                "robot": arm.config.name,
+                "cost": found.cost,
+                "time_s": whole.time_s,
+                "stages": whole.stages,
+                "poses": [
+                    {"name": t.name, "q": q, "status": p.status, "cost": p.cost}
+                    | {"tip_deviation_m": d, "metrics": dataclasses.asdict(m)}
+                    for t, q, p, d, m in zip(
+                        task.targets, found.q, found.plans, found.deviations, metrics, strict=True
+                    )
+                ],
+                "program": dataclasses.asdict(found.program),
+            }
+        )
+        return 0
+    _print_program(found.program)
+    table = Table("to", "plan", "T [s]", "stages", "overshoot peak [%]", "tip off the line [mm]")
+    for t, p, d, m in zip(task.targets, found.plans, found.deviations, metrics, strict=True):
+        peak = row_of(m.overshoot_peak, 100, 1)
+        row = (t.name, p.status, f"{m.time_s:.1f}", str(m.stages), peak, f"{1e3 * d:.1f}")
+        table.add_row(*row)
+    console.print(table)
+    console.print(
+        f"cost {found.cost:.6g}; {whole.time_s:.1f} s in {whole.stages} stages; the tool strays "
+        f"{1e3 * max(found.deviations):.1f} mm at most from the line through the poses"
+    )
+    if out is not None:
+        console.print(f"program written to {out}")
+    return 0
 
 
 def _print_program(program: Program) -> None:

@@ -219,7 +219,8 @@ class _Search:
         between = (1 - share) * bent[first] + share * bent[second]
         flat = between.reshape(-1, *bent.shape[1:])
         at = np.asarray(configuration_from_bending(flat), dtype=np.float64)
-        clear = clearances(self.robot, self.world, tendon_displacements(self.robot, at))
+        drawn = np.asarray(tendon_displacements(self.robot, at))
+        clear = clearances(self.robot, self.world, drawn)
         blocked = np.mean((clear < 0).reshape(_BETWEEN, -1), axis=0)
         matrix = np.zeros((len(bent), len(bent)))
         matrix[first, second] = matrix[second, first] = blocked

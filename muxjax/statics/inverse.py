@@ -33,7 +33,9 @@ Array = Any
 MOMENT_TOLERANCE = 1e-6  # moment left at a joint of a given posture, over mean stiffness * 1 rad
 POSITION_TOLERANCE = 1e-6  # [m]
 ANGLE_TOLERANCE = 1e-5  # [rad]
-SPARING = 1e-7  # weight of tension over bound against the error over its unit, squared
+SPARING = 1e-7  # final weight of tension over bound against the error over its unit, squared
+SPARING_STAGES = (1e3, 30.0, 1.0)  # times the final weight, by its root
+MOST_EVALUATIONS = 100  # of a stage
 
 
 class InverseResult(eqx.Module):
@@ -274,7 +276,10 @@ def _hold_pose(
 ) -> InverseResult:
     """Bounded nonlinear least squares on the tip of the equilibrium."""
     length = float(np.abs(chain.offset).sum() + np.abs(chain.tip[:3, 3]).sum())
+    # The weight on tension falls in stages, so that the path ends at the least of the tensions that
+    # do equally well and not at those nearest to the start.
     sparing = np.sqrt(SPARING) * 1e-2 / high
+    heavier = 1.0
     last: dict[str, Any] = {"q": None}
 
     def at(tension: Array) -> Equilibrium:
@@ -291,7 +296,7 @@ def _hold_pose(
         parts = [(tip[:3, 3] - goal[:3, 3]) / length]
         if turning:
             parts.append(Rotation.from_matrix(goal[:3, :3].T @ tip[:3, :3]).as_rotvec())
-        return np.concatenate([*parts, sparing * tension])
+        return np.concatenate([*parts, heavier * sparing * tension])
 
     def derivative(tension: Array) -> Array:
         eq = at(tension)
@@ -305,20 +310,24 @@ def _hold_pose(
             spin = np.swapaxes(eq.pose[:3, :3][None], -1, -2) @ change[:, :3, :3]
             body = np.stack([spin[:, 2, 1], spin[:, 0, 2], spin[:, 1, 0]], axis=0)
             rows.append(_inverse_right_jacobian(relative.as_rotvec()) @ body)
-        return np.concatenate([*rows, np.diag(sparing)])
+        return np.concatenate([*rows, np.diag(heavier * sparing)])
 
-    inner = np.clip(start, low + 1e-6 * (high - low), high - 1e-6 * (high - low))
-    found = least_squares(
-        error,
-        inner,
-        derivative,
-        bounds=(low, high),
-        x_scale=high,
-        xtol=1e-13,
-        ftol=1e-15,
-        gtol=1e-15,
-    )
-    tension = np.clip(found.x, low, high)
+    tension = start
+    for stage in SPARING_STAGES:
+        heavier = stage
+        inner = np.clip(tension, low + 1e-6 * (high - low), high - 1e-6 * (high - low))
+        found = least_squares(
+            error,
+            inner,
+            derivative,
+            bounds=(low, high),
+            x_scale=high,
+            xtol=1e-13,
+            ftol=1e-15,
+            gtol=1e-15,
+            max_nfev=MOST_EVALUATIONS,
+        )
+        tension = np.clip(found.x, low, high)
     eq = at(tension)
     away = float(np.linalg.norm(eq.pose[:3, 3] - goal[:3, 3]))
     angle = 0.0
@@ -327,7 +336,10 @@ def _hold_pose(
     near = away <= POSITION_TOLERANCE and angle <= ANGLE_TOLERANCE
     reason = "held"
     if not bool(eq.converged):
-        reason = "no equilibrium was found at the last tensions"
+        reason = (
+            f"no equilibrium was found at the last tensions, where {1e3 * away:.4g} mm and "
+            f"{np.degrees(angle):.4g} degrees are left"
+        )
     elif not near:
         reason = (
             f"no tensions within the bounds were found that hold the goal: {1e3 * away:.4g} mm and "

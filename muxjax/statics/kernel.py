@@ -30,6 +30,8 @@ Array = Any  # jax.Array | np.ndarray; mypy knows no operators of their union
 Vector = tuple[Array, Array, Array]
 Kernel = Literal["virtual_work", "couple"]
 
+HOLES_MEET = 1e-3  # gap of two holes at which they have met, as a share of the straight one
+
 
 class Frames(NamedTuple):
     """Frames of all bodies in the base frame, in the layout (E, p, ..., B)."""
@@ -459,16 +461,17 @@ def _inner(
 
 
 def holes_crossed(chain: ElasticChain, frames: Frames) -> Bool[Array, " B"]:
-    """Whether two consecutive holes of a tendon have passed each other along the arm.
+    """Whether two consecutive holes of a tendon have met or passed each other along the arm.
 
     For one joint half way between two holes that is tan(q / 2) > half gap / r (MODEL.md section
     9): from there on the tendon would push. The direction of the straight arm's chord, carried
-    by both beads, is what "along" means.
+    by both beads, is what "along" means. A solver comes to rest where the holes meet, since the
+    force turns round there: less than a thousandth of the straight gap counts as met.
     """
     straight = jnp.zeros((*chain.layout.joint.shape, 1), frames.origin.dtype)
-    direction = chords_of(chain, frames_of(chain, straight)).unit
+    gap = chords_of(chain, frames_of(chain, straight))
     (a, _), (b, _) = _chord_frames(chain, frames)
-    along = plus(turned(a, direction), turned(b, direction))
-    return ((dot(along, chords_of(chain, frames).unit) < 0) & chain.layout.used[..., None]).any(
-        (0, 1)
-    )
+    along = plus(turned(a, gap.unit), turned(b, gap.unit))
+    chords = chords_of(chain, frames)
+    left = 0.5 * dot(along, chords.unit) * chords.length
+    return ((left < HOLES_MEET * gap.length) & chain.layout.used[..., None]).any((0, 1))

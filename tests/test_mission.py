@@ -15,7 +15,6 @@ from muxjax.cli import main
 from muxjax.collision import WorldConfig, world_from_config
 from muxjax.hardware import LockstepLink
 from muxjax.kinematics import backbone
-from muxjax.pipeline.detour import plan_around
 from muxjax.pipeline.missions.files import MissionConfig, load_mission
 from muxjax.pipeline.missions.follow import TubeLine, posture_at
 from muxjax.pipeline.missions.plan import Planner
@@ -99,32 +98,6 @@ def wall_problem(muxarm, low: float, servos=(1, 2, 3), **fields) -> Problem:
     start, target = tendon_displacements(muxarm, ends)
     world = world_from_config(config)
     return Problem(start, target, servos=servos, world=world, preset="fastest", **fields)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("servos", [(1, 2, 3), (1,)])
-def test_a_blocked_order_goes_by_way_of_shapes_in_between(muxarm, servos):
-    problem = wall_problem(muxarm, 0.28, servos)
-    assert muxjax.plan(muxarm, problem).status == "failed"
-    found = plan_around(muxarm, problem)
-    assert len(found.plans) > 1
-    for before, after in zip(found.plans[:-1], found.plans[1:], strict=True):
-        assert np.array_equal(before.displacements[-1], after.displacements[0])
-        assert after.problem.axial == before.axial[-1]
-    assert swept_tendons(muxarm, problem.world, found.points).clearance > -2e-3
-    again = plan_around(muxarm, problem)
-    assert np.array_equal(found.q, again.q)
-    run = muxjax.execute(found.program, LockstepLink(muxarm, displacements=problem.start))
-    assert run.completed
-    assert np.abs(run.measured - problem.target).max() < 1e-4
-
-
-@pytest.mark.slow
-def test_no_way_is_reported_with_its_reason(muxarm):
-    with pytest.raises(PlanningError, match=r"no way around.*clear shapes, \d+ plans"):
-        plan_around(muxarm, wall_problem(muxarm, 0.28), most_edges=1)
-    with pytest.raises(ValueError, match="most_edges"):
-        plan_around(muxarm, wall_problem(muxarm, 0.28), most_edges=0)
 
 
 def test_a_moving_base_keeps_within_its_bound_between_samples():

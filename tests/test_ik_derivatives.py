@@ -65,6 +65,25 @@ def test_by_a_length(muxarm, segment):
     np.testing.assert_allclose(exact, numeric, rtol=1e-5, atol=1e-4)
 
 
+@pytest.mark.parametrize("frame", ["base", "tool"])
+def test_by_a_frame(muxarm, frame):
+    pose = independent.pose(muxarm, Q)
+
+    def displaced(robot, by):
+        direction = np.zeros((4, 4))
+        direction[:3, 3] = [0.3, -0.5, 0.8]
+        return eqx.tree_at(
+            lambda r: getattr(r, frame), robot, getattr(robot, frame) + by * direction
+        )
+
+    numeric = (near(displaced(muxarm, STEP), pose) - near(displaced(muxarm, -STEP), pose)) / (
+        2 * STEP
+    )
+    with jax.enable_x64(True):
+        exact = jax.jacfwd(lambda by: solve_ik(displaced(muxarm, by), pose, q0=Q, starts=8).q)(0.0)
+    np.testing.assert_allclose(exact, numeric, rtol=1e-5, atol=1e-4)
+
+
 def test_backwards_equals_forwards(muxarm):
     pose = independent.pose(muxarm, Q)
     with jax.enable_x64(True):

@@ -20,7 +20,7 @@ Array = jax.Array
 Point = tuple[Array, Array, Array]
 
 FAR = 1e3  # [m], where there is nothing
-_WRITTEN_OUT = 12  # obstacles of a kind; more are looped over
+_WRITTEN_OUT = 12  # obstacles of a kind, or pieces of a tube; more are looped over
 
 
 def root(square: Array) -> Array:
@@ -98,31 +98,49 @@ def _to_tube(line: Array, bore: Any, wall: Any, at: Point) -> Array:
     In front of an open end the nearest place is on the rim, in cylinder coordinates about the
     first or last piece of the line.
     """
-    best = jnp.full_like(at[0], FAR**2)
-    sideways, over = best, jnp.full_like(at[0], -FAR)
-    last = len(line) - 2
-    for k in range(last + 1):
-        along = line[k + 1] - line[k]
-        length = root(along @ along)
-        unit = along / jnp.where(length > 0, length, 1.0)
-        x, y, z = (p - line[k, i] for i, p in enumerate(at))
-        t = x * unit[0] + y * unit[1] + z * unit[2]
-        square = x * x + y * y + z * z
-        beyond = t - jnp.clip(t, 0.0, length)
-        across = jnp.maximum(square - t * t, 0.0)
-        nearer = across + beyond * beyond < best
-        best = jnp.where(nearer, across + beyond * beyond, best)
-        if wall is not None:
-            first_end = -t if k == 0 else jnp.full_like(t, -FAR)
-            last_end = t - length if k == last else jnp.full_like(t, -FAR)
-            sideways = jnp.where(nearer, across, sideways)
-            over = jnp.where(nearer, jnp.maximum(first_end, last_end), over)
+    along = line[1:] - line[:-1]
+    length = root(jnp.sum(along * along, axis=1))
+    unit = along / jnp.where(length > 0, length, 1.0)[:, None]
+    # An end that is not open is far from being passed.
+    order = jnp.arange(len(length))
+    front = jnp.where(order == 0, 0.0, -FAR)
+    back = jnp.where(order == len(length) - 1, 0.0, -FAR)
+    best, sideways, over = _nearest_piece((line[:-1], unit, length, front, back), at)
     if wall is None:
         return bore - root(best)
     off = root(jnp.where(over > 0, sideways, best))
     inside = jnp.maximum(bore - off, off - bore - wall)  # of the wall, across it
     outside = root(jnp.maximum(inside, 0.0) ** 2 + jnp.maximum(over, 0.0) ** 2)
     return outside + jnp.minimum(jnp.maximum(inside, over), 0.0)
+
+
+def _nearest_piece(pieces: tuple[Array, ...], at: Point) -> tuple[Array, Array, Array]:
+    """The nearest piece of a line: square distance, square across it, way past an open end.
+
+    Args:
+        pieces: Where each begins, its direction, its length, and what is added to the way past
+            its beginning and past its end, 0 at an open end.
+        at: Points.
+    """
+    far = 0 * at[0]  # not a constant: see arm._points
+    state = (far + FAR**2, far + FAR**2, far - FAR)
+
+    def step(state: tuple[Array, Array, Array], piece: Any) -> tuple[Any, None]:
+        start, unit, length, front, back = piece
+        x, y, z = (p - start[i] for i, p in enumerate(at))
+        t = x * unit[0] + y * unit[1] + z * unit[2]
+        across = jnp.maximum(x * x + y * y + z * z - t * t, 0.0)
+        beyond = t - jnp.clip(t, 0.0, length)
+        square = across + beyond * beyond
+        new = (square, across, jnp.maximum(front - t, back + t - length))
+        nearer = square < state[0]
+        return tuple(jnp.where(nearer, n, o) for n, o in zip(new, state, strict=True)), None
+
+    if len(pieces[0]) > _WRITTEN_OUT:
+        return lax.scan(step, state, pieces, unroll=_WRITTEN_OUT // 2)[0]
+    for k in range(len(pieces[0])):
+        state, _ = step(state, tuple(x[k] for x in pieces))
+    return state
 
 
 def half_diagonal_square(grid: Grid) -> Array:

@@ -42,8 +42,8 @@ SWEEP_ROWS = (1, 16, 256)
 BEYOND_LIMIT = 0.2  # [rad] by which a candidate may pass its bending limit before it is polished
 # A solution may pass its bending limit by this much [rad] and is then taken to lie on it.
 AT_LIMIT = 1e-9
-SIDES = (1.0, 1.0, -1.0, -1.0)  # of q1 in the four parts that ``sweep`` returns
-SIGNS = (1.0, -1.0, 1.0, -1.0)
+SIDES = np.array([1.0, 1.0, -1.0, -1.0])  # of q1 in the four parts that ``sweep`` returns
+SIGNS = np.array([1.0, -1.0, 1.0, -1.0])  # of w_2
 
 
 class Seeds(NamedTuple):
@@ -155,9 +155,8 @@ def _seeds_of(
         limit, values = sweep(length, w_min, Target(tuple(part[:4]), tuple(part[4:])), intervals)
         t = np.asarray(limit)[:, None] * np.linspace(-1.0, 1.0, intervals + 1)
         kept = [np.asarray(v)[: len(piece)] for v in values]
-        found.append(
-            _look(piece, t[: len(piece)], [part for v in kept for part in (v.real, v.imag)])
-        )
+        parts = np.stack([part for v in kept for part in (v.real, v.imag)])
+        found.append(_look(piece, t[: len(piece)], parts))
     if not found:
         return np.zeros(0, int), np.zeros((6, 0))
     seeds = Seeds(*(np.concatenate(x) for x in zip(*found, strict=True)))
@@ -170,19 +169,19 @@ def _seeds_of(
 def _look(
     rows: Int[np.ndarray, " rows"],
     t: Float[np.ndarray, "rows samples"],
-    values: list[Float[np.ndarray, "rows samples"]],
+    values: Float[np.ndarray, "parts rows samples"],
 ) -> Seeds:
-    """Brackets and guesses in the swept equation."""
-    found = []
-    for side, sign, e in zip(SIDES, SIGNS, values, strict=True):
-        row, low, high, at_low, at_high = _brackets(t, e)
-        one = np.ones(len(row))
-        found.append(Seeds(rows[row], side * one, sign * one, low, high, at_low, at_high))
-    for sign, plus, minus in ((1.0, values[0], values[2]), (-1.0, values[1], values[3])):
-        row, beside, guess = _folds(t, plus, minus)
-        none = np.zeros(len(row))
-        found.append(Seeds(rows[row], beside, sign + none, guess, guess, none, none))
-    return Seeds(*(np.concatenate(x) for x in zip(*found, strict=True)))
+    """Brackets and guesses in the swept equation, all four parts in one list."""
+    n = len(rows)
+    line, *ends = _brackets(np.tile(t, (4, 1)), values.reshape(4 * n, -1))
+    part, row = np.divmod(line, n)
+    brackets = Seeds(rows[row], SIDES[part], SIGNS[part], *ends)
+    plus, minus = (values[k : k + 2].reshape(2 * n, -1) for k in (0, 2))
+    line, side, guess = _folds(np.tile(t, (2, 1)), plus, minus)
+    part, row = np.divmod(line, n)
+    none = np.zeros(len(row))
+    folds = Seeds(rows[row], side, SIGNS[part], guess, guess, none, none)
+    return Seeds(*(np.concatenate(x) for x in zip(brackets, folds, strict=True)))
 
 
 def _brackets(

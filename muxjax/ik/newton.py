@@ -150,9 +150,13 @@ def newton(
     """
     ends, known = np.empty_like(b), np.empty((2, b.shape[1]))
     limits = np.full(len(length), np.inf) if theta_max is None else theta_max
-    # Put on the device once: every array from the host costs a call ten microseconds.
-    arm, factor, bound, count = jax.device_put((length, damping, limits, steps))
-    for piece, size in in_pieces(b.shape[1]):
+    pieces = in_pieces(b.shape[1])
+    given = (length, np.float64(damping), limits, np.int64(steps))
+    if len(pieces) > 1:
+        # Every array from the host costs a call ten microseconds; this costs a hundred, once.
+        given = jax.device_put(given)
+    arm, factor, bound, count = given
+    for piece, size in pieces:
         start, target = padded(b[:, piece], size), padded(goal[:, piece], size)
         last, errors = _iterate(arm, start, target, factor, bound, count)
         here = piece.stop - piece.start

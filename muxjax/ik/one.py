@@ -172,17 +172,15 @@ def _nearest(search: _Search) -> IkResult:
 
 
 def _from_all(search: _Search) -> IkResult:
-    """The nearest of all solutions; descents where there is none, or a continuum of them."""
-    robot, poses, reference = search[:3]
+    """The nearest of all solutions; from the table where none or a continuum is found."""
+    robot, poses, reference, weights = search[:4]
     every = all_ik(robot, poses)
     chosen = choose(robot, of_all(every), reference, {"distance": 1.0}, None)
     result = _result(search, chosen)
     open_rows = np.flatnonzero(~chosen.solved | ~np.asarray(every.complete))
     if not len(open_rows):
         return result
-    other = solve_by_descent(
-        robot, poses[open_rows], reference[open_rows], search.key, search.starts
-    )
+    other = from_table(robot, poses[open_rows], reference[open_rows], weights)
     other = jax.tree.map(np.asarray, other)
     distance = np.sum((bending_of(other.q) - bending_of(reference[open_rows])) ** 2, axis=-1)
     better = ~chosen.solved[open_rows] | (other.converged & (distance < chosen.cost[open_rows]))

@@ -28,7 +28,7 @@ from numpy.polynomial import Chebyshev, Polynomial
 
 from muxjax.batched import WIDE_VECTORS
 from muxjax.batched.formulas import product
-from muxjax.ik.arcs import Array, Numbers, conjugate, cross, dot, series
+from muxjax.ik.arcs import Array, Numbers, bend, conjugate, cross, dot, series
 
 INTERVALS = 64  # of the admissible arc of q3
 # A bracket of a solution at a bending limit reaches over it: w may pass its limit by this much
@@ -134,7 +134,8 @@ def point(
     s, q = target
     d = q[3]
     circle = _circle(target, lengths[2])
-    cosine, sine = jnp.cos(t), jnp.sin(t)
+    half = bend(t, jnp.zeros_like(t))  # cos and sin of t / 2 by series: XLA calls scalar ones
+    cosine, sine = 2 * half.c * half.c - 1, 2 * half.c * half.ex
     offset: Array = jnp.full_like(cosine, _OFFSET)
     for _ in range(FIXED_POINT_STEPS):
         w = _around(circle, offset, cosine, sine)[0]

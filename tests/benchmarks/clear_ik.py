@@ -1,8 +1,8 @@
 """Collision-free inverse kinematics in batches, beside a long random search.
 
 Targets are the poses of random configurations that are clear, so that every one of them has a clear
-solution. In the pipe these are scattered about the configurations of its task. The random search
-follows Levenberg-Marquardt from many uniform starts and takes any end that is clear.
+solution; uniform ones, and ones scattered about the configurations of the scene's task. The
+random search follows Levenberg-Marquardt from many uniform starts and takes any end that is clear.
 
     python -m tests.benchmarks.clear_ik
 """
@@ -80,31 +80,36 @@ def random_search(
             goal = np.repeat(tool_goals(host, pose[None]), starts, axis=1)
             found = levenberg(host, b, b, goal, np.ones(6), STEPS)
         there = (found.position < TOLERANCE) & (found.angle < TOLERANCE)
-        q = polar(host, found.b.T[there])
-        success[row] = len(q) > 0 and bool((clearance_of(robot, q, world) >= 0).any())
+        clear = clearance_of(robot, polar(host, found.b.T), world) >= 0
+        success[row] = bool((there & clear).any())
     return success
 
 
-def scenes(
-    count: int, rng: np.random.Generator
-) -> list[tuple[str, list[tuple[Robot, np.ndarray]]]]:
+def near_task(name: str, world: World, count: int, rng: np.random.Generator) -> list[Part]:
+    """Scattered about the configurations that a task names, each with its own base."""
+    muxarm = muxjax.load_robot("muxarm")
+    targets = [t for t in load_yaml(TaskConfig, resolve(name, "tasks")).targets if t.near_q_deg]
+    parts = []
+    for target in targets:
+        arm = muxarm
+        if target.base is not None:
+            frame = np.eye(4)
+            frame[:3, 3] = target.base.xyz_m
+            arm = eqx.tree_at(lambda r: r.base, muxarm, frame)
+        about = np.radians(np.asarray(target.near_q_deg))
+        parts.append((arm, scattered_clear(arm, about, world, count // len(targets), rng)))
+    return parts
+
+
+def scenes(count: int, rng: np.random.Generator) -> list[tuple[str, list[Part]]]:
     """Name, and for each base of the arm the configurations that make the targets."""
     muxarm, penta = muxjax.load_robot("muxarm"), muxjax.load_robot("penta")
     cabinet, pipe = load_world("cabinet"), load_world("s_pipe")
-    targets = [t for t in load_yaml(TaskConfig, resolve("s_pipe", "tasks")).targets if t.near_q_deg]
-    bases = []
-    for target in targets:
-        assert target.base is not None
-        assert target.near_q_deg is not None
-        frame = np.eye(4)
-        frame[:3, 3] = target.base.xyz_m
-        arm = eqx.tree_at(lambda r: r.base, muxarm, frame)
-        about = np.radians(target.near_q_deg)
-        bases.append((arm, scattered_clear(arm, about, pipe, count // len(targets), rng)))
     return [
         ("cabinet, muxarm", [(muxarm, random_clear(muxarm, cabinet, count, rng))]),
         ("cabinet, penta", [(penta, random_clear(penta, cabinet, count, rng))]),
-        ("s_pipe, muxarm", bases),
+        ("cabinet, near its task", near_task("cabinet", cabinet, count, rng)),
+        ("s_pipe, near its task", near_task("s_pipe", pipe, count, rng)),
     ]
 
 

@@ -15,8 +15,8 @@ from muxjax.ik import (
     solve_path,
 )
 from muxjax.kinematics import backbone, forward_kinematics, jacobian
-from muxjax.metrics import Metrics, evaluate
-from muxjax.planning import Plan, PlanningError, Problem, plan
+from muxjax.metrics import Metrics, evaluate, tension_along
+from muxjax.planning import Plan, PlanningError, Problem, Tension, plan
 from muxjax.robot import Robot, load_robot
 from muxjax.scheduler import Instruction, Program, schedule
 from muxjax.statics import (
@@ -29,6 +29,7 @@ from muxjax.statics import (
     forward_statics,
     inverse_statics,
     load_chain,
+    true_posture,
 )
 from muxjax.tendons import configuration_from_tendons, tendon_displacements
 from muxjax.workspace import load_sweep, sweep
@@ -54,6 +55,7 @@ __all__ = [
     "Run",
     "StaticsError",
     "StaticsStatus",
+    "Tension",
     "World",
     "all_ik",
     "attach_derivatives",
@@ -77,4 +79,6 @@ __all__ = [
     "solve_path",
     "sweep",
     "tendon_displacements",
+    "tension_along",
+    "true_posture",
 ]

@@ -266,10 +266,11 @@ def test_the_reduced_statics_has_the_tensions_of_the_full_one(muxarm, chain, rng
     assert np.percentile(gap, 90) < 3.0
 
 
-def test_gentle_asks_for_its_term(goal):
-    with pytest.raises(ValueError, match="no term 'tension'"):
-        muxjax.Problem(np.zeros(9), goal, preset="gentle")
-    assert muxjax.Problem(np.zeros(9), goal, preset="gentle", terms={"tension": Tension()})
+def test_gentle_has_its_term_unless_another_is_given(goal):
+    own = Tension(bending_stiffness=40.0)
+    for given, expected in (({}, Tension()), ({"tension": own}, own)):
+        problem = muxjax.Problem(np.zeros(9), goal, preset="gentle", terms=given)
+        assert dict(problem.weighted_terms)["tension"].term == expected
 
 
 @pytest.mark.parametrize("field", ["bending_stiffness", "tendon_stiffness"])
@@ -282,8 +283,8 @@ def test_a_term_without_springs_is_refused(field):
 def test_gentle_plans_pull_less_than_the_fastest(muxarm, chain, goal):
     """By the full statics, which the planner does not know."""
     programs = []
-    for preset, terms in (("gentle", {"tension": Tension()}), ("fastest", {})):
-        problem = muxjax.Problem(np.zeros(9), goal, servos=(1,), preset=preset, terms=terms)
+    for preset in ("gentle", "fastest"):
+        problem = muxjax.Problem(np.zeros(9), goal, servos=(1,), preset=preset)
         programs.append(muxjax.schedule(muxarm, muxjax.plan(muxarm, problem, "exact")))
     gentle, fastest = tension_along(muxarm, chain, programs)
     assert gentle.unsolved + fastest.unsolved == 0

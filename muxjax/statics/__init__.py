@@ -10,16 +10,19 @@ from muxjax.statics.chain import ElasticChain
 from muxjax.statics.files import elastic_chain, load_chain
 from muxjax.statics.forward import forward_statics
 from muxjax.statics.inverse import InverseResult, inverse_statics
+from muxjax.statics.posture import Posture, true_posture
 from muxjax.statics.result import Equilibrium, StaticsError, StaticsStatus
 
 __all__ = [
     "ElasticChain",
     "Equilibrium",
     "InverseResult",
+    "Posture",
     "StaticsError",
     "StaticsStatus",
     "elastic_chain",
     "forward_statics",
     "inverse_statics",
     "load_chain",
+    "true_posture",
 ]

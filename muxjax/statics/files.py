@@ -52,8 +52,9 @@ class ChainSegmentConfig(Strict):
     n_beads: Sourced[Annotated[int, Field(ge=1, le=2000)]]
     length_m: Sourced[Positive]
     joints: Sourced[tuple[Annotated[str, Field(pattern=r"^[xyz]+(\|[xyz]+)?$")], ...]] = Field(
-        description="joint axes of successive beads, repeated, all in the middle of the pitch; "
-        "holes are in the bead's upper face, or where a bar stands: between the joints"
+        description="joint axes of successive beads, repeated, all in the middle of the pitch (a "
+        "rod with holes at every second, fourth ... bead: at 1/3 and 2/3 in turn); holes are in "
+        "the bead's upper face, or where a bar stands: between the joints"
     )
     hinge: HingeConfig | None = None
     rod: RodConfig | None = None
@@ -173,8 +174,9 @@ def _assemble(
     for segment, count in zip(config.segments, counts, strict=True):
         pitch = (length or segment.length_m.value) / count
         for bead in range(count):
-            _add_bead(parts, segment, count, bead, pitch, above)
-            above = pitch / 2
+            below = pitch * _joint_height(segment, bead, every)
+            _add_bead(parts, segment, count, bead, pitch, above + below)
+            above = pitch - below
             if parts.holes[-1][0] != len(parts.axis) and (
                 "|" not in _pattern(segment, bead) or bead == count - 1
             ):
@@ -215,13 +217,26 @@ def _pattern(segment: ChainSegmentConfig, bead: int) -> str:
     return segment.joints.value[bead % len(segment.joints.value)]
 
 
+def _joint_height(segment: ChainSegmentConfig, bead: int, every: int) -> float:
+    """Height of a bead's joints as a share of its pitch: hinges are in the middle.
+
+    A rod that bends between two holes of a tendon stands off the tendon's chord, by h^2 / 12 of its
+    curvature in the mean over a pitch h of holes, and that much the tendon's lever changes.
+    Joints in the middle of N beads give (1 / 12 + 1 / (6 N^2)) h^2; pairs of joints at 1/6 and 5/6
+    of two beads give exactly 1 / 12, and the arm's bending as a whole as well.
+    """
+    if segment.rod is None or every % 2:
+        return 0.5
+    return 1 / 3 if bead % 2 == 0 else 2 / 3
+
+
 def _add_bead(
     parts: _Parts,
     segment: ChainSegmentConfig,
     count: int,
     bead: int,
     pitch: float,
-    above: float,
+    height: float,
 ) -> None:
     """The joints of one bead; where an axis occurs several times, they are springs in series."""
     finer = count / segment.n_beads.value
@@ -230,7 +245,7 @@ def _add_bead(
     for i, name in enumerate(names):
         series = names.count(name)
         parts.axis.append(AXES[name])
-        parts.height.append(above + pitch / 2 if i == 0 else 0.0)
+        parts.height.append(height if i == 0 else 0.0)
         parts.stiffness.append(series * _stiffness(segment, name, pitch, finer))
         parts.cubic.append(series**3 * _cubic(segment, name, finer))
         last = i == len(names) - 1
@@ -263,7 +278,7 @@ def _cubic(segment: ChainSegmentConfig, axis: str, finer: float) -> float:
 def elastic_chain(
     robot: Robot,
     *,
-    bending_stiffness: float = 3.0,
+    bending_stiffness: float = 15.0,
     tendon_stiffness: float = 2e4,
     slack_width: float = 0.01,
     mass: float = 0.5,
@@ -277,8 +292,9 @@ def elastic_chain(
 
     Args:
         robot: The arm.
-        bending_stiffness: Of one universal joint, about both axes [N m/rad] (assumed: 35 N in one
-            tendon bend a joint by 20 degrees).
+        bending_stiffness: Of one universal joint, about both axes [N m/rad] (assumed: twelve
+            springs of 4 N/mm, 25 mm from the axis; with soft springs and stiff tendons the arm
+            kinks between its discs, see docs/muxarm_under_load.md).
         tendon_stiffness: K_t of every tendon [N/m] (assumed: about a metre of 1 mm steel rope).
         slack_width: Tension below which a tendon goes slack smoothly [N].
         mass: Of the arm beyond its base [kg], spread evenly over the discs (assumed: 20 g a

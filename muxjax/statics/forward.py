@@ -6,7 +6,9 @@ for what the plain iteration did not solve, and the traced path with implicit de
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any, cast, get_args
 
 import equinox as eqx
@@ -177,26 +179,35 @@ def _lanes(loads: Loads, of: Any) -> Loads:
 def _solve_chunks(
     chain: ElasticChain, q0: Array | None, given: Array, loads: Loads, **options: Any
 ) -> Solution:
-    """One round of the iteration, in chunks of lanes; short ones are filled with their last row."""
+    """One round of the iteration, in chunks of lanes; short ones are filled with their last row.
+
+    XLA runs a chunk on one core, so the chunks are shared out to threads. The first one compiles.
+    """
     rows = given.shape[-1]
     lanes = next((n for n in LANES if n >= rows), LANES[-1])
-    found = []
-    for first in range(0, rows, lanes):
+
+    def chunk(first: int) -> list[Array]:
         pick = np.minimum(np.arange(first, first + lanes), rows - 1)
         start = None if q0 is None else q0[:, pick]
-        found.append(
-            _compiled(
-                chain,
-                start,
-                given[:, pick],
-                _lanes(loads, lambda x, at=pick: x[..., at]),
-                **options,
-            )
-        )
-    columns = zip(*found, strict=True)
-    return Solution(
-        *(np.concatenate([np.asarray(x) for x in c], axis=-1)[..., :rows] for c in columns)
-    )
+        own = _lanes(loads, lambda x: x[..., pick])
+        with jax.enable_x64(True):  # a setting of each thread
+            found = _compiled(chain, start, given[:, pick], own, **options)
+            return [np.asarray(x) for x in found]
+
+    firsts = range(0, rows, lanes)
+    parts = [chunk(first) for first in firsts[:1]]
+    if len(firsts) > 1:
+        with ThreadPoolExecutor(min(cores(), len(firsts) - 1)) as pool:
+            parts.extend(pool.map(chunk, firsts[1:]))
+    columns = zip(*parts, strict=True)
+    return Solution(*(np.concatenate(column, axis=-1)[..., :rows] for column in columns))
+
+
+def cores() -> int:
+    """Processor cores that this process may use."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
 
 
 def _solve_rows(

@@ -113,7 +113,8 @@ def _draw_tensions(axes: Any, chain: ElasticChain, found: Equilibrium) -> None:
     axes.set_ylabel("tension [N]")
     axes.tick_params(labelsize=8)
     axes.grid(axis="y", alpha=0.25)
-    axes.legend(fontsize=8, frameon=False, ncols=3, loc="upper right")
+    axes.legend(fontsize=8, frameon=False, ncols=3, loc="upper right", handlelength=1.0,
+                columnspacing=0.8, borderaxespad=0.2)  # fmt: skip
 
 
 def draw_errors(found: Experiment, path: str | Path) -> Path:
@@ -203,19 +204,21 @@ def _draw_filter(axes: Any, found: Experiment) -> None:
 
 
 def draw_pitch(
-    beads: Sequence[int], errors: Mapping[str, Sequence[float]], path: str | Path
+    errors: Mapping[str, tuple[Sequence[int], Sequence[float]]], path: str | Path
 ) -> Path:
     """Error against the number of beads a segment, a line for each case or statistic.
 
     Args:
-        beads: A segment.
-        errors: Tip error as a share of length, by name.
+        errors: By name: beads a segment, and tip error as a share of length.
         path: Image to write.
     """
     figure, axes = _log_log("beads a segment", "tip error [% of length]")
-    for name, values in errors.items():
+    for name, (beads, values) in errors.items():
         axes.plot(beads, 100 * np.asarray(values), marker="o", label=name)
-    axes.set_xticks(list(beads), [str(n) for n in beads])
+    counts = [n for beads, _ in errors.values() for n in beads]
+    doublings = int(np.log2(max(counts) / min(counts)) + 1)
+    ticks = [min(counts) * 2**k for k in range(doublings + 1)]
+    axes.set_xticks(ticks, [str(n) for n in ticks])
     axes.xaxis.set_minor_locator(mpl.ticker.NullLocator())
     axes.legend(frameon=False, fontsize=9)
     return _save(figure, path)
@@ -224,14 +227,14 @@ def draw_pitch(
 def draw_cost(
     joints: Sequence[int], seconds: Mapping[str, Sequence[float]], path: str | Path
 ) -> Path:
-    """Time a solve against the number of joints, with the slope of each line.
+    """CPU time against the number of joints, with the slope of each line.
 
     Args:
         joints: Of the chain.
-        seconds: A solve, by method.
+        seconds: By what they are the time of.
         path: Image to write.
     """
-    figure, axes = _log_log("joints", "time a solve [ms]")
+    figure, axes = _log_log("joints", "CPU time [ms]")
     for name, values in seconds.items():
         slope = float(np.polyfit(np.log(joints), np.log(values), 1)[0])
         axes.plot(joints, 1e3 * np.asarray(values), marker="o", label=f"{name}, slope {slope:.2f}")

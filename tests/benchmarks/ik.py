@@ -1,8 +1,10 @@
-"""Inverse kinematics side by side: `python -m tests.benchmarks.ik [--targets 2000]`.
+"""Inverse kinematics side by side: `python -m tests.benchmarks.ik [--targets 10000]`.
 
 Random reachable targets of MuxArm, bending uniform within the limits, one seed. Ours in its
 methods, beside scipy and optimistix from one random start in an environment of their own
 (``ik_peers_runner``). Figures are CPU time over all threads; the seconds of first calls are wall.
+Started on one core (``taskset -c 0 python -m ...``) it counts core-seconds; on several, what the
+threads lose between two cores' caches comes on top.
 """
 
 from __future__ import annotations
@@ -81,10 +83,17 @@ def first_calls() -> list[list[str]]:
     return rows
 
 
+def row(name: str, times: list[float], count: int, solved: float) -> list[str]:
+    """A line of the table from the CPU-seconds of each round."""
+    middle, low, high = (1e6 * x / count for x in spread(times))
+    shown = f"{middle:.1f} ({low:.1f}-{high:.1f})"
+    return [name, shown, f"{1e6 / middle:.0f}", f"{100 * solved:.2f}"]
+
+
 def main() -> None:
     """Measure and print a table."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("--targets", type=int, default=2000)
+    parser.add_argument("--targets", type=int, default=10_000)
     parser.add_argument("--rounds", type=int, default=5)
     options = parser.parse_args()
     robot = muxjax.load_robot("muxarm")
@@ -104,42 +113,33 @@ def main() -> None:
             lambda: float(np.mean([np.any(all_ik(robot, p).mask) for p in poses[:FEW]])),
         ),
     }
-    for method in ("all", "levenberg_marquardt", "pseudo_inverse"):
-        contestants[f"one solution, {method}"] = (
-            lambda method=method: solve_ik(robot, poses[:BATCH], method=method),
-            min(BATCH, len(poses)),
-            lambda method=method: float(
-                np.mean(solve_ik(robot, poses[:BATCH], method=method).converged)
+    for method, most in (
+        ("all", len(poses)),
+        ("levenberg_marquardt", len(poses)),
+        ("pseudo_inverse", BATCH),
+    ):
+        few = poses[:most]
+        contestants[f"one solution, {method}, {len(few)} in a call"] = (
+            lambda method=method, few=few: solve_ik(robot, few, method=method),
+            len(few),
+            lambda method=method, few=few: float(
+                np.mean(solve_ik(robot, few, method=method).converged)
             ),
         )
     times = rounds({name: call for name, (call, _, _) in contestants.items()}, options.rounds)
-    rows = []
-    for name, (_, count, success) in contestants.items():
-        middle, low, high = (1e6 * x / count for x in spread(times[name]))
-        rows.append(
-            [
-                name,
-                f"{middle:.1f} ({low:.1f}-{high:.1f})",
-                f"{1e6 / middle:.0f}",
-                f"{100 * success():.2f}",
-            ]
-        )
     found = peers(robot, poses[:FEW], max(3, options.rounds // 2))
-    notes = ["micsolver (C++) is on no package index and is not measured here"]
-    if isinstance(found, str):
-        notes.append(f"scipy, optimistix: {found}")
-    else:
-        for name, peer in found.items():
-            middle, low, high = (1e6 * x for x in spread(peer["times"]))
-            label = f"{name} {peer['version']}, Levenberg-Marquardt or trust region, one start"
-            shown = f"{middle:.1f} ({low:.1f}-{high:.1f})"
-            rows.append([label, shown, f"{1e6 / middle:.0f}", f"{100 * peer['solved']:.2f}"])
+    rows = [
+        row(name, times[name], count, success())
+        for name, (_, count, success) in contestants.items()
+    ]
+    missing = f"\n\nscipy, optimistix: {found}" if isinstance(found, str) else ""
+    for name, peer in {} if isinstance(found, str) else found.items():
+        rows.append(row(f"{name} {peer['version']}, one start", peer["times"], 1, peer["solved"]))
     print(f"{machine()}; seed {SEED}\n")
-    print(
-        table(["", "CPU us a target, median (quartiles)", "targets / core-s", "solved [%]"], rows)
-    )
+    header = ["", "CPU us a target, median (quartiles)", "targets / core-s", "solved [%]"]
+    print(table(header, rows) + missing)
     header = ["first call in a fresh process", "wall s", "with the persistent cache"]
-    print("\n" + table(header, first_calls()) + "\n\n" + "\n".join(notes))
+    print("\n" + table(header, first_calls()))
 
 
 if __name__ == "__main__":

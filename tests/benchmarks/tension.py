@@ -1,10 +1,13 @@
 """Tendon tension of plans, ours and the paper's, over assumed springs and tendons.
 
     python -m tests.benchmarks.tension [targets]
+    python -m tests.benchmarks.tension posture
+    python -m tests.benchmarks.tension friction
 
-The claim is "reduces tendon load by up to 50 %" (M abstract, VI-A). Targets as in Table II's
-protocol (``configs/bench/table2.yaml``, seed 0), from the straight arm, with one to three servos;
-unlike there, a step moves a tendon all the way.
+``posture``: how far constant curvature is from the statics; ``friction``: a winding loop. The
+claim is "reduces tendon load by up to 50 %" (M abstract, VI-A). Targets as in Table II's protocol
+(``configs/bench/table2.yaml``, seed 0), from the straight arm, with one to three servos; unlike
+there, a step moves a tendon all the way.
 Neither springs, tendons nor the arm's own mass are published: every figure stands with its range.
 """
 
@@ -25,6 +28,7 @@ from muxjax.metrics.statistics import paired_difference, spread
 from muxjax.metrics.tension import TensionProfile, tension_along
 from muxjax.planning.tension import Tension
 from muxjax.statics import ElasticChain, elastic_chain, forward_statics
+from muxjax.statics.friction import winding_loop
 from muxjax.statics.transmission import load_test, tendon_forces
 from tests.benchmarks.common import machine, table
 
@@ -32,6 +36,11 @@ SERVO_SETS = ((1,), (1, 2), (1, 2, 3))
 # 12 springs of 1.3 to 13 N/mm, 25 mm from the axis, between two discs: 6 k r^2.
 BENDING = (5.0, 15.0, 50.0)  # [N m/rad]
 TENDON = (5e3, 2e4, 5e4)  # [N/m]: polymer cord to steel rope, about a metre of it
+MOUNTINGS = {  # gravity in the world [m/s^2]; the arm's base points up
+    "hanging": (0.0, 0.0, 9.81),
+    "horizontal": (9.81, 0.0, 0.0),
+    "upright": (0.0, 0.0, -9.81),
+}
 MASS = 0.5  # of the arm beyond its base [kg]; 2.17 kg is published with the driver
 BASELINES = ("sequential", "reverse", "greedy")
 OURS = {
@@ -49,7 +58,6 @@ def programs(
 ) -> dict[tuple[str, int], list[muxjax.Program]]:
     """Of every setting and servo set, one a target."""
     found: dict[tuple[str, int], list[muxjax.Program]] = {}
-    gentle = {"tension": Tension()}
     for servos, (name, (method, preset)) in product(SERVO_SETS, SETTINGS.items()):
         found[name, len(servos)] = [
             muxjax.schedule(
@@ -61,7 +69,6 @@ def programs(
                         protocol.target(robot, 0, number),
                         servos=servos,
                         preset=preset,
-                        terms=gentle if preset == "gentle" else {},
                     ),
                     method,
                 ),
@@ -143,8 +150,53 @@ def surrogate_error(robot: muxjax.Robot, chain: ElasticChain, term: Tension, n: 
     )
 
 
+def postures(robot: muxjax.Robot) -> str:
+    """Gap between the tools by statics and by constant curvature, over springs and mountings."""
+    rng = np.random.default_rng(0)
+    theta = rng.uniform(0.2, 1.6, (60, robot.n_segments))
+    phi = rng.uniform(0, 2 * np.pi, theta.shape)
+    goals = muxjax.tendon_displacements(robot, np.stack([theta, phi], -1).reshape(60, -1))
+    length, rows = float(np.sum(robot.length)), []
+    for bending, payload in product(BENDING, (0.0, 0.5)):
+        row = [f"{bending:g}", f"{payload:g}"]
+        for gravity in MOUNTINGS.values():
+            chain = elastic_chain(robot, bending_stiffness=bending, mass=MASS, gravity=gravity)
+            found = muxjax.true_posture(robot, chain, goals, payload=payload)
+            gap = np.percentile(100 * found.position_gap[found.converged] / length, [50, 90])
+            row.append(f"{gap[0]:.1f} / {gap[1]:.1f} % of {found.converged.sum()}")
+        rows.append(row)
+    return table(["springs [N m/rad]", "payload [kg]", *MOUNTINGS], rows)
+
+
+def friction_loops(robot: muxjax.Robot) -> str:
+    """Tendon 1 wound in by 40 mm and paid out, by friction: tension and tool half-way, work."""
+    chain, rows, steps = elastic_chain(robot, bending_stiffness=15.0, mass=MASS), [], 40
+    for friction in (0.0, 0.1, 0.2):
+        loop = winding_loop(chain, 1, depth=0.04, friction=friction, steps=steps)
+        inward, outward = 2 * steps + steps // 2, 3 * steps + steps // 2  # of the second round
+        pull = loop.tension[2 * steps :]
+        moved = np.diff(loop.displacements[2 * steps :], axis=0)
+        apart = np.linalg.norm(loop.pose[inward, :3, 3] - loop.pose[outward, :3, 3])
+        rows.append(
+            [
+                f"{friction:g}",
+                f"{loop.tension[inward, 0]:.1f}",
+                f"{loop.tension[outward, 0]:.1f}",
+                f"{1e3 * apart:.1f}",
+                f"{-(0.5 * (pull[1:] + pull[:-1]) * moved).sum():.3f}",
+                f"{loop.converged.mean():.0%}",
+            ]
+        )
+    header = ["mu", "inwards [N]", "outwards [N]", "tool apart [mm]", "work of a loop [J]"]
+    return table([*header, "solved"], rows)
+
+
 def main() -> None:
     """Measure and print tables."""
+    alone = {"posture": postures, "friction": friction_loops}
+    if sys.argv[1:] and sys.argv[1] in alone:
+        print(alone[sys.argv[1]](muxjax.load_robot("muxarm")))
+        return
     robot, n = muxjax.load_robot("muxarm"), int(sys.argv[1]) if len(sys.argv) > 1 else 15
     protocol = load_yaml(Protocol, resolve("table2", "bench"))
     print(f"{machine()}\n\n{n} targets, upright, arm of {MASS} kg (assumed), full moves.\n")

@@ -68,9 +68,12 @@ def read_measurements(path: str | Path, chain: ElasticChain) -> Measurements:
         chain: Whose tendons the columns are; its size also tells millimetres from metres.
 
     Raises:
-        ValueError: Missing or unknown columns, text, NaN, negative tension, a quaternion that is
-            not of length 1, or values that look like another unit; names line and column.
+        ValueError: No such file, missing or unknown columns, text, NaN, negative tension, a
+            quaternion that is not of length 1, or values that look like another unit; names line
+            and column.
     """
+    if not Path(path).is_file():
+        raise ValueError(f"{path}: no such file")
     columns, lines = _columns(Path(path))
     source = Path(path).name
     m = chain.n_tendons

@@ -63,6 +63,24 @@ class Program:
     instructions: tuple[Instruction, ...]
 
 
+@dataclass(frozen=True, eq=False)
+class Trajectory:
+    """Tendon displacements as a polyline in time: of a program, or as a board has made them.
+
+    Attributes:
+        time_s: When each point is reached [s], never falling.
+        displacements: Tendon displacements at the points [m]; straight lines in between.
+    """
+
+    time_s: Float[np.ndarray, " P"]
+    displacements: Float[np.ndarray, "P SJ"]
+
+    def at(self, times: Float[np.ndarray, " T"]) -> Float[np.ndarray, "T SJ"]:
+        """Displacements [m] at any times [s]; constant before the first and after the last."""
+        columns = [np.interp(times, self.time_s, column) for column in self.displacements.T]
+        return np.stack(columns, axis=-1)
+
+
 def schedule(robot: Robot, plan: Plan) -> Program:
     """Instructions that execute a plan (M Eq. 10-12).
 

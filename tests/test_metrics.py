@@ -118,7 +118,7 @@ def test_tip_deviation_is_what_a_dense_look_finds(muxarm, rng):
     target = random_targets(muxarm, rng, 1)[0]
     program = muxjax.schedule(muxarm, plan(muxarm, Problem(np.zeros(9), target, servos=(1, 2))))
     line = timeline(muxarm, program)
-    states = line.at(np.linspace(0, line.times[-1], 5001))
+    states = line.at(np.linspace(0, line.time_s[-1], 5001))
     poses = muxjax.forward_kinematics(muxarm, muxjax.configuration_from_tendons(muxarm, states))
     tips = poses[:, :3, 3]
     along = (tips[-1] - tips[0]) / np.linalg.norm(tips[-1] - tips[0])

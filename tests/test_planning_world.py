@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import pairwise, permutations
 
 import numpy as np
 import pytest
 from test_planning import random_targets
 
 import muxjax
-from muxjax.collision import WorldConfig, world_from_config
+from muxjax.collision import SphereConfig, WorldConfig, attach, world_from_config
 from muxjax.metrics import program_cost, timeline
-from muxjax.planning import Problem, plan
+from muxjax.planning import METHODS, Problem, plan
 from muxjax.planning.world import SWEEP_TOLERANCE, speed_bound
 
 
@@ -25,7 +26,7 @@ def world_of(*obstacles: dict) -> muxjax.World:
 
 def least_clearance(robot, found, world, samples=1500) -> float:
     line = timeline(robot, muxjax.schedule(robot, found))
-    states = line.at(np.linspace(0.0, line.times[-1], samples))
+    states = line.at(np.linspace(0.0, line.time_s[-1], samples))
     return float(
         np.min(muxjax.clearance(robot, muxjax.configuration_from_tendons(robot, states), world))
     )
@@ -38,7 +39,7 @@ def blocked(muxarm):
     problem = Problem(np.zeros(9), target, servos=(1, 2, 3), preset="no-overshoot")
     free = plan(muxarm, problem)
     line = timeline(muxarm, muxjax.schedule(muxarm, free))
-    states = line.at(np.linspace(0.0, line.times[-1], 60)[1:-1])
+    states = line.at(np.linspace(0.0, line.time_s[-1], 60)[1:-1])
     tips = muxjax.forward_kinematics(muxarm, muxjax.configuration_from_tendons(muxarm, states))
     ends = muxjax.configuration_from_tendons(muxarm, np.stack([problem.start, target]))
     for tip in tips[:, :3, 3]:
@@ -76,27 +77,34 @@ def test_closeness_has_a_price(muxarm, blocked):
     assert hasty.cost <= program_cost(muxarm, bold, muxjax.schedule(muxarm, careful)) + 1e-9
 
 
-def test_a_plan_that_does_not_exist_is_not_found(muxarm, rng):
-    """A shell of balls closes the straight arm's tip in, and the target is outside."""
-    target = random_targets(muxarm, rng, 1)[0]
-    tip = muxjax.forward_kinematics(muxarm, np.zeros(6))[:3, 3]
-    shell = [
-        {"kind": "sphere", "centre_m": (tip + np.array(side)).tolist(), "radius_m": 0.03}
-        for side in ([0.07, 0, 0], [-0.07, 0, 0], [0, 0.07, 0], [0, -0.07, 0])
-    ]
-    world = world_of(*shell, {"kind": "sphere", "centre_m": [0.3, 0.3, 0.0], "radius_m": 0.01})
-    end = muxjax.clearance(muxarm, muxjax.configuration_from_tendons(muxarm, target), world)
-    problem = Problem(np.zeros(9), target, world=world)
-    if end < 0:
-        with pytest.raises(ValueError, match=r"Problem.target: the arm is .* mm deep"):
-            plan(muxarm, problem)
-        return
-    for method in ("exact", "beamstep", "sequential"):
+# A wall beside the straight arm, from 155 mm up, and an arm that reaches under it.
+WALL = {"kind": "box", "centre_m": [0.075, 0.0, 0.555], "size_m": [0.02, 3.0, 0.8]}
+UNDER_IT = [1.6, 0.0, 0.3, 0.0, 0.2, 0.0]
+
+
+def test_a_plan_that_does_not_exist_is_not_found(muxarm):
+    """Every order leads through the wall: by the planners, and by a walk along every order."""
+    target, world = muxjax.tendon_displacements(muxarm, UNDER_IT), world_of(WALL)
+    problem = Problem(np.zeros(9), target, world=world, action_set="all")
+    ends = muxjax.configuration_from_tendons(muxarm, np.stack([problem.start, target]))
+    assert muxjax.clearance(muxarm, ends, world).min() > 0.0
+    for method in METHODS:
         found = plan(muxarm, problem, method)
-        if found.status != "failed":
-            assert least_clearance(muxarm, found, world) >= -SWEEP_TOLERANCE
-        else:
-            assert found.reason
+        assert found.status == "failed", method
+        assert found.cost == np.inf
+        if method in ("exact", "beamstep"):
+            assert "passes through a collision" in found.reason
+    assert plan(muxarm, replace(problem, world=None)).status == "optimal"
+    share = np.linspace(0.0, 1.0, 200)[:, None]
+    for order in permutations(range(3)):
+        states = [problem.start]
+        for layer in order:
+            after = states[-1].copy()
+            after[3 * layer : 3 * layer + 3] = target[3 * layer : 3 * layer + 3]
+            states.append(after)
+        path = np.concatenate([a + share * (b - a) for a, b in pairwise(states)])
+        clear = muxjax.clearance(muxarm, muxjax.configuration_from_tendons(muxarm, path), world)
+        assert clear.min() < -SWEEP_TOLERANCE
 
 
 def test_start_and_target_in_collision_are_refused(muxarm, rng):
@@ -112,13 +120,26 @@ def test_start_and_target_in_collision_are_refused(muxarm, rng):
 
 
 def test_no_point_of_the_arm_is_faster_than_its_bound(muxarm, rng):
+    """Nor is what the tool carries, which here stands half a metre off."""
+    plain, far = world_of(WALL), (0.0, 0.3, 0.4)
+    laden = attach(plain, [SphereConfig(kind="sphere", centre_m=far, radius_m=0.01)])
     starts, ends = random_targets(muxarm, rng, 40).reshape(2, 20, 9)
     fraction = np.linspace(0, 1, 801)[:, None]
-    bound = np.asarray(speed_bound(muxarm, starts, ends))
-    for start, end, limit in zip(starts, ends, bound, strict=True):
+    limits = [np.asarray(speed_bound(muxarm, starts, ends, world)) for world in (plain, laden)]
+    tried = 0
+    for start, end, arm_limit, laden_limit in zip(starts, ends, *limits, strict=True):
         q = muxjax.configuration_from_tendons(muxarm, start + fraction * (end - start))
         if not np.isfinite(q).all():
             continue
         points = muxjax.backbone(muxarm, q, 4)[..., :3, 3]
-        speed = np.linalg.norm(np.diff(points, axis=0), axis=-1).max() * 800
-        assert speed <= limit * (1 + 1e-2)
+        assert _fastest(points) <= arm_limit * (1 + 1e-2)
+        tool = muxjax.forward_kinematics(muxarm, q)
+        carried = tool[:, :3, :3] @ np.array(far) + tool[:, :3, 3]
+        assert _fastest(carried) <= laden_limit * (1 + 1e-2)
+        tried += 1
+    assert tried > 10
+
+
+def _fastest(points: np.ndarray) -> float:
+    """Greatest speed of any point along 801 equal parts of a leg [m a leg]."""
+    return float(np.linalg.norm(np.diff(points, axis=0), axis=-1).max() * 800)

@@ -23,7 +23,7 @@ def test_a_program_is_feasible_and_adds_up(muxarm, rng, servos, method):
         problem = Problem(start, target, servos=servos, max_step=max_step)
         # A lattice of 0.02 m steps between two bent poses is large for the exact planner alone.
         if method == "exact" and max_step is not None:
-            problem = Problem(0 * start, target, servos=servos, max_step=0.04)
+            problem = Problem(0 * start, target, servos=servos, max_step=0.06)
         found = plan(muxarm, problem, method)
         program = muxjax.schedule(muxarm, found)
         total = np.zeros(9)

@@ -12,7 +12,6 @@ import secrets
 import time
 from collections import deque
 from collections.abc import Callable, Collection, Iterable
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
@@ -22,22 +21,10 @@ from muxjax.hardware.physics import PhysicsConfig
 from muxjax.hardware.protocol import MAX_DIVIDER, Frame
 from muxjax.hardware.virtual_board import VirtualBoard
 from muxjax.robot import Robot
+from muxjax.scheduler import Trajectory
 
 if TYPE_CHECKING:
     import can
-
-
-@dataclass(frozen=True, eq=False)
-class Trajectory:
-    """True tendon displacements as a polyline in time.
-
-    Attributes:
-        time_s: Break points [s] from arming on, never falling, shape (K,).
-        displacements: True displacements there [m], shape (K, S*J); straight lines in between.
-    """
-
-    time_s: Float[np.ndarray, " K"]
-    displacements: Float[np.ndarray, "K S*J"]
 
 
 class Link(Protocol):

@@ -2,20 +2,21 @@
 
 from muxjax.metrics.program import (
     Metrics,
-    Timeline,
     evaluate,
     least_time,
     program_cost,
     timeline,
     tip_deviation,
 )
+from muxjax.metrics.tension import TensionProfile, tension_along
 
 __all__ = [
     "Metrics",
-    "Timeline",
+    "TensionProfile",
     "evaluate",
     "least_time",
     "program_cost",
+    "tension_along",
     "timeline",
     "tip_deviation",
 ]

@@ -6,7 +6,6 @@ Everything here is computed on the Program, because that is what is executed (MO
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -15,10 +14,11 @@ from jaxtyping import Bool, Float
 
 from muxjax.kinematics import forward_kinematics
 from muxjax.planning.motion import STRAIGHT, angles_at, bending_angles, overshoot_profile
-from muxjax.planning.problem import Problem, Term, Transition, step
+from muxjax.planning.problem import Problem, Transition, step
+from muxjax.planning.terms import CostTerm
 from muxjax.precision import host_array, pad_rows
 from muxjax.robot import Robot
-from muxjax.scheduler import Program, waypoints
+from muxjax.scheduler import Program, Trajectory, waypoints
 from muxjax.tendons import configuration_from_tendons
 
 Array = jax.Array | np.ndarray
@@ -53,25 +53,7 @@ class Metrics:
     travel_m: float
 
 
-@dataclass(frozen=True)
-class Timeline:
-    """A program as a piecewise linear motion: stretches between consecutive points.
-
-    Attributes:
-        times: When each point is reached [s], non-decreasing, the first is 0.
-        displacements: Tendon displacements at the points [m].
-    """
-
-    times: Float[np.ndarray, " P"]
-    displacements: Float[np.ndarray, "P SJ"]
-
-    def at(self, times: Float[np.ndarray, " T"]) -> Float[np.ndarray, "T SJ"]:
-        """Displacements [m] at any times [s]; constant before the first and after the last."""
-        columns = [np.interp(times, self.times, column) for column in self.displacements.T]
-        return np.stack(columns, axis=-1)
-
-
-def timeline(robot: Robot, program: Program) -> Timeline:
+def timeline(robot: Robot, program: Program) -> Trajectory:
     """When the tendons are where: waiting for the axial motor, then the legs of each instruction.
 
     Raises:
@@ -85,7 +67,7 @@ def timeline(robot: Robot, program: Program) -> Timeline:
     displacements = np.concatenate(points)
     moving = np.max(np.abs(np.diff(displacements, axis=0)), axis=-1) / float(robot.tendon_speed)
     times = np.cumsum(np.concatenate(waits) + np.concatenate([[0.0], moving]))
-    return Timeline(times, displacements)
+    return Trajectory(times, displacements)
 
 
 def _repositions(program: Program) -> Bool[np.ndarray, " I"]:
@@ -101,9 +83,9 @@ def evaluate(robot: Robot, program: Program) -> Metrics:
         ValueError: The program was made for another robot.
     """
     line = timeline(robot, program)
-    duration = float(line.times[-1])
+    duration = float(line.time_s[-1])
     before, after = line.displacements[:-1], line.displacements[1:]
-    seconds, peak = _overshoot(robot, before, after, np.diff(line.times), line.displacements[-1])
+    seconds, peak = _overshoot(robot, before, after, np.diff(line.time_s), line.displacements[-1])
     goal = angles_at(robot, line.displacements[-1:])[0]
     relative = np.where(
         goal >= STRAIGHT, np.maximum(peak, 0.0) / np.maximum(goal, STRAIGHT), np.nan
@@ -218,17 +200,20 @@ def program_cost(robot: Robot, problem: Problem, program: Program) -> float:
     before, after = (np.concatenate(side) for side in zip(*legs, strict=True))
     first_leg = np.concatenate([np.arange(len(b)) == 0 for b, _ in legs])
     switched = np.repeat(_repositions(program), [len(b) for b, _ in legs])
+    # Expensive terms are data here too: other obstacles need no other compilation.
+    split = [problem.compiled_terms(expensive=kind) for kind in (False, True)]
+    weights = np.concatenate([w for _, w in split])
     with jax.enable_x64(True):
         terms = _leg_terms(
             robot,
-            problem.weighted_terms,
+            split[0][0] + split[1][0],
             pad_rows(before),
             pad_rows(after - before),
             pad_rows((first_leg & switched).astype(float)),
             pad_rows((first_leg & ~switched).astype(float)),
             problem.target,
         )
-        return float(problem.weight_vector @ np.asarray(terms)[:, : len(before)].sum(axis=1))
+        return float(weights @ np.asarray(terms)[:, : len(before)].sum(axis=1))
 
 
 def _overshoot(
@@ -262,10 +247,10 @@ def _profile(
     return overshoot_profile(robot, before, after, duration, bending_angles(robot, end))
 
 
-@partial(jax.jit, static_argnums=1)
+@jax.jit
 def _leg_terms(
     robot: Robot,
-    terms: tuple[tuple[str, Term], ...],
+    terms: tuple[CostTerm, ...],
     before: Float[Array, "P SJ"],
     move: Float[Array, "P SJ"],
     repositions: Float[Array, " P"],
@@ -274,4 +259,4 @@ def _leg_terms(
 ) -> Float[Array, "T P"]:
     goal = bending_angles(robot, target)
     transition: Transition = step(robot, before, move, repositions, engages, goal)
-    return jnp.stack([term(robot, transition) for _, term in terms])
+    return jnp.stack([term(robot, transition) for term in terms])

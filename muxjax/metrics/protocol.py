@@ -25,6 +25,8 @@ class Setting(Strict):
     method: str
     preset: str | None = None
     weights: dict[str, Annotated[float, Field(ge=0)]] | None = None
+    max_step_mm: Positive | None = None  # in place of the protocol's
+    action_set: Literal["subsets", "all", "multistep", "splits"] = "subsets"
     whose: Whose
 
     @model_validator(mode="after")
@@ -35,6 +37,8 @@ class Setting(Strict):
             )
         if (self.preset is None) == (self.weights is None):
             raise ValueError(f"{self.name}: give either preset or weights")
+        if self.action_set == "splits" and self.max_step_mm is not None:
+            raise ValueError(f"{self.name}: action set 'splits' has no max_step_mm")
         return self
 
 
@@ -95,11 +99,13 @@ class Protocol(Strict):
     ) -> Problem:
         """From the straight arm to a target [m]."""
         objective = {"preset": setting.preset} if setting.preset else {"weights": setting.weights}
+        largest = (setting.max_step_mm or self.max_step_mm.value) / 1e3
         return Problem(
             np.zeros_like(target),
             target,
             servos=servos,
-            max_step=self.max_step_mm.value / 1e3,
+            max_step=None if setting.action_set == "splits" else largest,
+            action_set=setting.action_set,
             **objective,
         )
 

@@ -180,10 +180,10 @@ def _samples(
 ) -> tuple[Float[np.ndarray, " P"], Float[np.ndarray, "P SJ"]]:
     """When the tendons are where: the corners of the timeline, and points on its legs."""
     line = timeline(robot, program)
-    times = [line.times[:1]]
-    for k in range(1, len(line.times)):
+    times = [line.time_s[:1]]
+    for k in range(1, len(line.time_s)):
         moves = bool((line.displacements[k] != line.displacements[k - 1]).any())
         share = np.arange(1, a_leg + 1) / a_leg if moves else np.ones(1)
-        times.append(line.times[k - 1] + share * (line.times[k] - line.times[k - 1]))
+        times.append(line.time_s[k - 1] + share * (line.time_s[k] - line.time_s[k - 1]))
     flat = np.concatenate(times)
     return flat, line.at(flat)

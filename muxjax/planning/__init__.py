@@ -20,6 +20,7 @@ from muxjax.planning.problem import (
     Transition,
     check_problem,
 )
+from muxjax.planning.tension import Tension
 from muxjax.robot import Robot
 
 METHODS: Mapping[str, Callable[..., Plan]] = {
@@ -39,6 +40,7 @@ __all__ = [
     "PlanBatch",
     "PlanningError",
     "Problem",
+    "Tension",
     "Transition",
     "front",
     "plan",

@@ -74,7 +74,8 @@ def plan_batch(robot: Robot, starts: Any, targets: Any, **fields: Any) -> PlanBa
     common = Problem(begins[0], goals[0], **fields)
     check_problem(robot, common)
     check_ends(robot, "starts", begins, "targets", goals)
-    if common.max_step is not None or common.compiled_terms(expensive=True)[0]:
+    full = common.max_step is None and common.action_set != "splits"
+    if not full or common.compiled_terms(expensive=True)[0]:
         raise ValueError("plan_batch: is for full moves without obstacles; use plan for the others")
     if not full_moves.fits(robot):
         raise ValueError(

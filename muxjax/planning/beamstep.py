@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from muxjax.planning.baselines import greedy, reverse, sequential
-from muxjax.planning.bounds import AdmissibleBound
+from muxjax.planning.bounds import AdmissibleBound, bound_of
 from muxjax.planning.lattice import Lattice
 from muxjax.planning.problem import Plan
 from muxjax.planning.replay import Step, failed, replay
@@ -64,7 +64,7 @@ def beamstep(
     """
     _check_options(width, gap, deadline_s)
     began = monotonic()
-    bound = AdmissibleBound(lattice)
+    bound = bound_of(lattice)
     incumbent = min((rule(lattice) for rule in (sequential, reverse, greedy)), key=lambda p: p.cost)
     best = _Incumbent(incumbent.cost, None)
     proved, expansions = 0.0, 0
@@ -144,11 +144,9 @@ def _search(
             done = ~level.remaining.any(axis=1)
             promise = level.cost + bound(level.remaining, level.stop)
             hopeful = np.flatnonzero(~done & (promise < best.cost))
-            order = level.cost + (
-                bound(level.remaining, level.stop, for_order=True)
-                if value_fn is None
-                else _values(lattice, level, value_fn)
-            )
+            order = promise
+            if value_fn is not None:
+                order = level.cost + _values(lattice, level, value_fn)
             ranked = hopeful[np.argsort(order[hopeful], kind="stable")]
             arriving = np.flatnonzero(done & (level.cost < best.cost))
             unsure = rows[np.concatenate([ranked[:width], arriving])]

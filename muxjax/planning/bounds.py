@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from functools import cached_property
+from functools import cached_property, lru_cache
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from muxjax.planning.lattice import Lattice
 from muxjax.planning.motion import angles_at
-from muxjax.planning.patterns import BendingPattern
+from muxjax.planning.patterns import Prices, VisitPattern
 from muxjax.planning.problem import TERMS
 
 
@@ -20,9 +20,11 @@ class AdmissibleBound:
     - switches: stops still needed by the unfinished tendons that the present stop does not reach;
     - time: those stops' repositioning, and the motion if every servo could always work (a first
       engagement without repositioning is left out);
-    - bending: the last step ends at the target's bending, and a pattern database knows more where
-      its tables are small enough (``patterns.py``);
-    - overshoot and terms of a user: nothing, which is a bound because no term may be negative.
+    - bending: the last step ends at the target's bending, and a pattern database knows more; so it
+      does about switches beyond those needed, and about overshoot while the drum moves
+      (``patterns.py``);
+    - other terms, and overshoot while tendons move: nothing, which is a bound because no term may
+      be negative.
     """
 
     def __init__(self, lattice: Lattice) -> None:
@@ -36,53 +38,45 @@ class AdmissibleBound:
         }
 
     def __call__(
-        self,
-        remaining: Int[np.ndarray, "N SJ"],
-        stop: Int[np.ndarray, " N"],
-        *,
-        for_order: bool = False,
+        self, remaining: Int[np.ndarray, "N SJ"], stop: Int[np.ndarray, " N"]
     ) -> Float[np.ndarray, " N"]:
-        """Bound at states.
-
-        Args:
-            remaining: Steps that each tendon has to go.
-            stop: The present one, or -1.
-            for_order: Leave out the pattern by actions: it rises in jumps, and tighter as it is, it
-                ranks the states of a level worse than the pattern by steps alone.
-        """
+        """Bound at states: steps that each tendon has to go, and the present stop, or -1."""
         unfinished = remaining > 0
         residual = np.abs(self._end - self._lattice.displacements(remaining)) * unfinished
-        stops = self._stops_needed(unfinished, stop)
+        visits = self._stops_needed(unfinished, stop)
+        stops = visits.sum(axis=-1)
         by_term = {
             "travel": residual.sum(axis=-1),
             "switches": stops,
             "time": stops * float(self._lattice.robot.switch_time) + self._motion_time(residual),
-            "bending": self._bending(
-                remaining, self._patterns[:1] if for_order else self._patterns
-            ),
+            "bending": unfinished.any(axis=-1) * float(np.sum(self._end_angles**2)),
         }
         total = np.zeros(len(remaining))
         for name, weight in self._weights.items():
             if name in by_term:
                 total = total + weight * by_term[name]
-        return total
-
-    def _bending(
-        self, remaining: Int[np.ndarray, "N SJ"], patterns: list[BendingPattern]
-    ) -> Float[np.ndarray, " N"]:
-        end = float(np.sum(self._end_angles**2))
-        last = np.where((remaining > 0).any(axis=-1), end, 0.0)
-        for pattern in patterns:
-            last = np.maximum(last, pattern(remaining))
-        return last
+        more = known = self._weights.get("bending", 0.0) * by_term["bending"]
+        for pattern in self._patterns:
+            more = np.maximum(more, pattern(remaining, stop, visits))
+        return total + (more - known)
 
     @cached_property
-    def _patterns(self) -> list[BendingPattern]:
-        if not self._weights.get("bending"):
+    def _patterns(self) -> list[VisitPattern]:
+        robot, weights = self._lattice.robot, self._weights
+        if not (weights.get("bending") or weights.get("overshoot")):
             return []
+        seconds = float(robot.switch_time)
+        prices = Prices(
+            bending=weights.get("bending", 0.0),
+            switch=weights.get("switches", 0.0) + seconds * weights.get("time", 0.0),
+            waiting=seconds * weights.get("overshoot", 0.0),
+        )
+        goal = angles_at(robot, self._lattice.problem.target[None])[0]
         one_servo = int(self._lattice.reach.sum(axis=1).max()) == 1  # the two are then the same
-        kinds = (False,) if one_servo else (False, True)
-        return [BendingPattern(self._lattice, in_actions=kind) for kind in kinds]
+        return [
+            VisitPattern(self._lattice, prices, goal, in_actions=kind)
+            for kind in ((False,) if one_servo else (False, True))
+        ]
 
     @cached_property
     def _end(self) -> Float[np.ndarray, " SJ"]:
@@ -102,14 +96,20 @@ class AdmissibleBound:
 
     def _stops_needed(
         self, unfinished: Bool[np.ndarray, "N SJ"], stop: Int[np.ndarray, " N"]
-    ) -> Int[np.ndarray, " N"]:
+    ) -> Int[np.ndarray, "N groups"]:
         reach = self._lattice.reach
         here = np.where((stop >= 0)[:, None], reach[stop], False)
         elsewhere = self._by_layer(unfinished & ~here).sum(axis=-1)
-        return np.ceil(elsewhere / reach.sum(axis=-1).max()).astype(np.int64).sum(axis=-1)
+        return np.ceil(elsewhere / reach.sum(axis=-1).max()).astype(np.int64)
 
     def _motion_time(self, residual: Float[np.ndarray, "N SJ"]) -> Float[np.ndarray, " N"]:
         layers = self._by_layer(residual)
         servos = self._lattice.reach.sum(axis=-1).max()
         shortest = np.maximum(layers.max(axis=-1), layers.sum(axis=-1) / servos)
         return shortest.sum(axis=-1) / float(self._lattice.robot.tendon_speed)
+
+
+@lru_cache(maxsize=1)
+def bound_of(lattice: Lattice) -> AdmissibleBound:
+    """The lattice's bound; planners that follow each other share its pattern databases."""
+    return AdmissibleBound(lattice)

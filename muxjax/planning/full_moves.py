@@ -147,29 +147,30 @@ def edge_costs(
     costs = []
     for layer in range(table.n_segments):
         begin, finish = (corners[layer][d] for d in (table.leg_before, table.leg_after))
-        fraction = ((np.arange(LEG_POINTS) + 0.5) / LEG_POINTS)[:, None]
-        along = (begin[:, None] + fraction * (finish - begin)[:, None]).reshape(-1, table.j)
+        fraction = ((np.arange(LEG_POINTS) + 0.5) / LEG_POINTS)[:, None, None]
+        along = (begin + fraction * (finish - begin)).reshape(-1, table.j)
         points = [*corners[:layer], along, *corners[layer + 1 :]]
         theta_along = _whole(layered_angles(robot, points))
         shape = list(theta_along.shape)
-        shape[layer : layer + 1] = [len(begin), LEG_POINTS]
+        shape[layer + 1 : layer + 2] = [LEG_POINTS, len(begin)]
+        # The short axes stand first in memory, where sums over them run over whole rows.
+        theta_along = jax.lax.optimization_barrier(theta_along.reshape(shape))
+        theta_along = jnp.moveaxis(theta_along, (layer + 1, 0), (-2, -1))
         before, after = (
             _whole_displacements([*corners[:layer], side, *corners[layer + 1 :]])
             for side in (begin, finish)
         )
-        theta_before = jnp.take(at_corners, table.leg_before, axis=layer)
-        theta_after = jnp.take(at_corners, table.leg_after, axis=layer)
+        theta_before, theta_after = (
+            jnp.moveaxis(jnp.take(at_corners, side, axis=layer + 1), 0, -1)
+            for side in (table.leg_before, table.leg_after)
+        )
 
         def cost(
             repositions: float,
             engages: float,
             before: Array = before,
             after: Array = after,
-            theta: tuple[Array, Array, Array] = (
-                theta_before,
-                theta_after,
-                jnp.moveaxis(theta_along.reshape(shape), layer + 1, -2),
-            ),
+            theta: tuple[Array, Array, Array] = (theta_before, theta_after, theta_along),
         ) -> Array:
             flags = jnp.full(before.shape[:-1], repositions)
             wait = waiting_time(robot, flags, jnp.full_like(flags, engages))
@@ -192,14 +193,13 @@ def _rows(robot: Robot, displacements: Array) -> Array:
 
 
 def _whole(angles: list[jax.Array]) -> Array:
-    """Angles by segment on the whole grid, the segment last."""
+    """Angles by segment on the whole grid, the segment first."""
     shape = angles[-1].shape
     return jnp.stack(
         [
             jnp.broadcast_to(a.reshape(*a.shape, *(1,) * (len(shape) - a.ndim)), shape)
             for a in angles
-        ],
-        axis=-1,
+        ]
     )
 
 

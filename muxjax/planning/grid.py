@@ -40,8 +40,13 @@ def layered_angles(robot: Robot, points: Sequence[Float[Array, "_ J"]], xp: Any 
         points: For each layer, displacements [m] of its tendons at P_i points.
         xp: ``jax.numpy`` in compiled code, or ``numpy``.
     """
-    rests = layered_rests(robot, points, xp)
-    return [xp.sqrt(xp.sum(xp.stack(_bending(robot, i, r, xp)) ** 2, axis=0)) for i, r in rests]
+    angles = []
+    for i, rest in layered_rests(robot, points, xp):
+        bx, by = _bending(robot, i, rest, xp)
+        angle = xp.sqrt(bx * bx + by * by)
+        # Without the barrier XLA would compute an angle anew for every use of it.
+        angles.append(angle if xp is np else jax.lax.optimization_barrier(angle))
+    return angles
 
 
 def layered_rests(

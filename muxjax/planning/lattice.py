@@ -48,9 +48,43 @@ class Lattice:
     @cached_property
     def steps(self) -> Int[np.ndarray, " SJ"]:
         """n_c: steps of each tendon from the start. The tolerance guards the rounding."""
+        if self.problem.action_set == "splits":
+            return np.array([len(stops) for stops in self._splits])
         residual = np.abs(self.problem.target - self.problem.start)
         needed = np.ceil((residual - self.problem.tolerance) / self.max_step)
         return np.maximum(needed, 0).astype(np.int64)
+
+    @cached_property
+    def _splits(self) -> list[list[float]]:
+        """Where each tendon may stop, as a way [m] from its start: its end last.
+
+        Servos that wind two tendons of a layer lose no time while both go equally far, so its
+        longest one may stop after another one's way, or with another one's way left to go.
+        """
+        tolerance = self.problem.tolerance
+        ways = np.abs(self.problem.target - self.problem.start)
+        splits = []
+        for layer in ways.reshape(self.robot.n_segments, -1):
+            for way in layer:
+                others = layer[layer < way] if way == max(layer) else layer[:0]
+                kept: list[float] = []
+                for stop in np.sort([*others, *(way - others)]):
+                    if min(stop - (kept[-1] if kept else 0.0), way - stop) > tolerance:
+                        kept.append(float(stop))
+                splits.append([*kept, float(way)] if way > tolerance else [])
+        return splits
+
+    @cached_property
+    def _made(self) -> Float[np.ndarray, "SJ most"]:
+        """Way [m] that each tendon has gone after k of its steps; behind its last, all of it."""
+        ways = np.abs(self.problem.target - self.problem.start)
+        if self.problem.action_set != "splits":
+            count = np.arange(self.steps.max() + 1)
+            return np.minimum(count * self.max_step, ways[:, None])
+        made = np.zeros((len(ways), self.steps.max() + 1))
+        for row, stops in zip(made, self._splits, strict=True):
+            row[1 : len(stops) + 1] = stops
+        return made
 
     @cached_property
     def reach(self) -> Bool[np.ndarray, "stops SJ"]:
@@ -108,9 +142,8 @@ class Lattice:
 
     def displacements(self, remaining: Int[np.ndarray, "*n SJ"]) -> Float[np.ndarray, "*n SJ"]:
         """Displacements [m] of states."""
-        residual = self.problem.target - self.problem.start
-        made = np.minimum((self.steps - remaining) * self.max_step, np.abs(residual))
-        return self.problem.start + np.sign(residual) * made
+        made = self._made[np.arange(len(self.steps)), self.steps - remaining]
+        return self.problem.start + np.sign(self.problem.target - self.problem.start) * made
 
     def expand(
         self, remaining: Int[np.ndarray, "N SJ"]

@@ -1,146 +1,181 @@
-"""A pattern database for bending: states told apart by how much each layer still needs.
+"""Bending and switches together: a pattern database of layers told apart by what they need.
 
-What a layer needs is counted in steps of its tendons, of which an action takes off at most as many
-as there are servos, or in actions, of which it takes off at most one. Either way a plan passes
-through a path on the small grid of these numbers. A point of the grid costs the least bending that
-any state there can have; the cheapest path is then a lower bound on what bending is still to be
-paid for. Segments 1 and 2 are minimised together over all their states (pairs of layer states).
-The tendons of layer 3 have for their own segment what is left by the first two, a vector from one
-cloud minus a vector from another: their distance along the best of a few directions bounds segment
-3. (By M Eq. 4-6 segment 3 depends on layer 1 too, off the image of Eq. 6.)
+A layer's class is "untouched", "done", or how much it needs at least, counted in actions, of which
+an action takes off one at most, or in steps of its tendons, of which it takes off as many as there
+are servos. Whatever a plan does, its classes walk down a small grid, and each step there costs the
+least bending that any state of these classes can have. The grid also knows the layer at which the
+drum stands: to enter another one is a switch. A layer needs so many visits anyway, which
+``bounds.py`` counts; the grid charges those beyond. So bending less by going to and fro between the
+layers has its price.
+
+Least bendings are those of ``extents.py`` where tendons run straight, and those of
+``pair_patterns.py`` where layers 1 and 2 have few states.
 """
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 from jaxtyping import Float, Int
 
-from muxjax.planning.grid import layered_angles, layered_rests
+from muxjax.planning.extents import extents, least_angles, runs_straight
 from muxjax.planning.lattice import Lattice
+from muxjax.planning.motion import STRAIGHT
+from muxjax.planning.pair_patterns import Points, least_bending, pairs_fit
 
-MOST_PAIRS = 3_000_000  # states of layers 1 and 2 together; beyond, there is no pattern
-_DIRECTIONS = 24
-_PAIRS_AT_ONCE = 100_000
+MOST_STATES = 1_000_000  # of one layer; beyond, there is no pattern
+MOST_VALUES = 3_000_000  # of the grid with its counters; beyond, switches are not charged
 
 
-class BendingPattern:
-    """Least sum of |theta|^2 [rad^2] over the steps to go, by what the first layers still need.
+class Prices(NamedTuple):
+    """What one unit costs."""
+
+    bending: float  # of rad^2 and step
+    switch: float  # of a switch
+    waiting: float  # of relative overshoot while the drum moves
+
+
+class VisitPattern:
+    """Lower bound on the bending still to come, and on switches beyond those that are counted.
+
+    Args:
+        lattice: The problem on the robot.
+        prices: What is charged.
+        goal: Bending of the target [rad], above which a segment overshoots.
+        in_actions: What a layer needs is counted in actions, else in steps.
 
     Attributes:
-        layers: How many layers, from the base, are told apart: 2 or 3, 0 where there is no pattern.
+        layers: How many layers, from the base, the grid has; 0 where there is no pattern.
     """
 
-    def __init__(self, lattice: Lattice, *, in_actions: bool) -> None:
+    def __init__(
+        self,
+        lattice: Lattice,
+        prices: Prices,
+        goal: Float[np.ndarray, " S"],
+        *,
+        in_actions: bool,
+    ) -> None:
+        robot, j = lattice.robot, lattice.robot.tendons_per_segment
         self._lattice, self._in_actions = lattice, in_actions
-        robot = lattice.robot
-        per_layer = np.prod(lattice.steps.reshape(robot.n_segments, -1) + 1.0, axis=1)
-        self.layers = min(robot.n_segments, 3) if lattice.one_layer_a_step else 0
-        if self.layers < 2 or per_layer[0] * per_layer[1] > MOST_PAIRS or per_layer.max() > 1e6:
+        self._servos = int(lattice.reach.sum(axis=1).max())
+        steps = lattice.steps.reshape(robot.n_segments, j)
+        self.layers = min(robot.n_segments, 3)
+        few = np.prod(steps + 1.0, axis=1).max() <= MOST_STATES
+        if not (lattice.one_layer_a_step and few):
             self.layers = 0
             return
-        self._value = self._cheapest(self._node_costs())
+        points = [self._points(layer) for layer in range(self.layers)]
+        if not (runs_straight(robot) or pairs_fit(points)):
+            self.layers = 0
+            return
+        node, waiting = _least_costs(lattice, points, prices, goal)
+        visits = -(-(steps > 0).sum(axis=1)[: self.layers] // self._servos)
+        if (self.layers + 1) * np.prod(visits + 1) * node.size > MOST_VALUES:
+            visits, prices = 0 * visits, prices._replace(switch=0.0)
+        most = 1 if in_actions else self._servos
+        self._value = _cheapest(node, waiting, prices.switch, visits, most)
 
-    def __call__(self, remaining: Int[np.ndarray, "N SJ"]) -> Float[np.ndarray, " N"]:
-        """Lower bound for states."""
+    def __call__(
+        self,
+        remaining: Int[np.ndarray, "N SJ"],
+        stop: Int[np.ndarray, " N"],
+        visits: Int[np.ndarray, "N S"],
+    ) -> Float[np.ndarray, " N"]:
+        """Bound at states, in which so many visits of each layer are counted already."""
         if not self.layers:
             return np.zeros(len(remaining))
-        by_layer = remaining.reshape(len(remaining), self._lattice.robot.n_segments, -1)
-        return np.asarray(self._value[tuple(self._needed(by_layer).T[: self.layers])])
+        robot = self._lattice.robot
+        left = remaining.reshape(len(remaining), robot.n_segments, -1)
+        steps = self._lattice.steps.reshape(robot.n_segments, -1)
+        classes = [self._class(left[:, i], steps[i]) for i in range(self.layers)]
+        layer_of_stop = self._lattice.reach.reshape(len(self._lattice.reach), robot.n_segments, -1)
+        place = np.argmax(layer_of_stop.any(axis=-1), axis=-1)[stop]
+        # From a layer that the grid leaves out, or an unknown one, every layer has to be entered.
+        place = np.where((stop < 0) | (place >= self.layers), self.layers, place)
+        most = np.array(self._value.shape[1 : 1 + self.layers]) - 1
+        counted = np.minimum(visits[:, : self.layers], most)
+        return np.asarray(self._value[(place, *counted.T, *classes)])
 
-    def _needed(self, left: Int[np.ndarray, "*n J"]) -> Int[np.ndarray, "*n"]:
+    def _class(
+        self, left: Int[np.ndarray, "N J"], steps: Int[np.ndarray, " J"]
+    ) -> Int[np.ndarray, " N"]:
+        needed, most = self._needed(left), int(self._needed(steps[None])[0])
+        return np.where((left == steps).all(axis=-1) & (most > 0), most + 1, needed)
+
+    def _needed(self, left: Int[np.ndarray, "N J"]) -> Int[np.ndarray, " N"]:
         """Steps that finish a layer, or fewest actions: a tendon's own, and all by the servos."""
-        servos = int(self._lattice.reach.sum(axis=1).max())
-        if self._lattice.problem.action_set == "multistep":
+        if self._lattice.problem.action_set in ("multistep", "splits"):
             left = np.minimum(left, 1)  # one action may finish a tendon
         if not self._in_actions:
             return np.asarray(left.sum(axis=-1))
-        return np.maximum(left.max(axis=-1), -(-left.sum(axis=-1) // servos))
+        return np.maximum(left.max(axis=-1), -(-left.sum(axis=-1) // self._servos))
 
-    def _points(self, layer: int) -> tuple[Float[np.ndarray, "P J"], Int[np.ndarray, " P"]]:
-        """Displacements [m] of a layer's tendons in all its states, sorted by what these need."""
+    def _points(self, layer: int) -> Points:
         lattice, j = self._lattice, self._lattice.robot.tendons_per_segment
         columns = slice(layer * j, (layer + 1) * j)
-        left = np.indices([int(n) + 1 for n in lattice.steps[columns]]).reshape(j, -1).T
-        left = left[np.argsort(self._needed(left), kind="stable")]
+        steps = lattice.steps[columns]
+        left = np.indices([int(n) + 1 for n in steps]).reshape(j, -1).T
         remaining = np.zeros((len(left), lattice.robot.n_tendons), dtype=np.int64)
         remaining[:, columns] = left
-        return lattice.displacements(remaining)[:, columns], self._needed(left)
+        return lattice.displacements(remaining)[:, columns], self._class(left, steps)
 
-    def _node_costs(self) -> Float[np.ndarray, "..."]:
-        """Least bending of any state with given needs."""
-        robot = self._lattice.robot
-        points = [self._points(layer) for layer in range(self.layers)]
-        first, second = (np.searchsorted(t, np.arange(t[-1] + 1)) for _, t in points[:2])
-        angle = 2 * np.pi * np.arange(_DIRECTIONS) / _DIRECTIONS
-        directions = np.stack([np.cos(angle), np.sin(angle)])
-        least = np.full((len(first), len(second)), np.inf)
-        longest = np.full(least.shape, -np.inf)  # of segment 3's arc, without its own tendons
-        furthest = np.full((*least.shape, _DIRECTIONS), -np.inf)
-        rows = max(1, _PAIRS_AT_ONCE // len(points[1][0]))
-        probe = [np.zeros((1, robot.tendons_per_segment))] * (self.layers - 2)
-        for t1, begin in enumerate(first):
-            end = first[t1 + 1] if t1 + 1 < len(first) else len(points[0][0])
-            for i in range(int(begin), int(end), rows):
-                part = points[0][0][i : min(i + rows, int(end))]
-                grid = [part, points[1][0]]
-                one, two = layered_angles(robot, grid, np)
-                square = np.nan_to_num(one[:, None] ** 2 + two**2, nan=np.inf).min(axis=0)
-                least[t1] = np.minimum(least[t1], np.minimum.reduceat(square, second))
-                if not probe:
-                    continue
-                _, rest = layered_rests(robot, [*grid, *probe], np)[-1]
-                bad = ~np.isfinite(rest.arc[..., 0])
-                arc = np.where(bad, -np.inf, rest.arc[..., 0]).max(axis=0)
-                longest[t1] = np.maximum(longest[t1], np.maximum.reduceat(arc, second))
-                for k, (dx, dy) in enumerate(directions.T):
-                    along = -(dx * rest.mx + dy * rest.my)[..., 0]
-                    top = np.where(bad, -np.inf, along).max(axis=0)
-                    furthest[t1, :, k] = np.maximum(
-                        furthest[t1, :, k], np.maximum.reduceat(top, second)
-                    )
-        if not probe:
-            return least
-        return least[..., None] + self._third(points[2], directions, longest, furthest)
 
-    def _third(
-        self,
-        points: tuple[Float[np.ndarray, "P J"], Int[np.ndarray, " P"]],
-        directions: Float[np.ndarray, "2 K"],
-        longest: Float[np.ndarray, "T1 T2"],
-        furthest: Float[np.ndarray, "T1 T2 K"],
-    ) -> Float[np.ndarray, "T1 T2 T3"]:
-        """Least theta_3^2: own harmonic minus what the first two layers take, over the arc."""
-        robot = self._lattice.robot
-        own, left = points
-        zero = np.zeros((1, robot.tendons_per_segment))
-        _, straight = layered_rests(robot, [zero, zero, own], np)[-1]
-        begins = np.searchsorted(left, np.arange(left[-1] + 1))
-        mean = straight.arc[0, 0] - robot.length[2]
-        longer = np.maximum.reduceat(mean, begins)
-        harmonic = np.stack([straight.mx[0, 0], straight.my[0, 0]], axis=-1) @ directions
-        nearest = np.minimum.reduceat(harmonic, begins, axis=0)  # (T3, K)
-        apart = np.full((*longest.shape, len(begins)), 0.0)
-        for k in range(directions.shape[1]):
-            apart = np.maximum(apart, nearest[:, k] - furthest[..., k, None])
-        arc = np.maximum(longest[..., None] + longer, 1e-9)
-        theta = apart * robot.length[2] / (robot.tendon_radius * arc)
-        return np.nan_to_num(theta**2, posinf=0.0)
+def _least_costs(
+    lattice: Lattice, points: list[Points], prices: Prices, goal: Float[np.ndarray, " S"]
+) -> tuple[Float[np.ndarray, "..."], Float[np.ndarray, "..."]]:
+    """Of a step into given classes, and of a switch in them."""
+    robot = lattice.robot
+    sizes = [int(of_class.max()) + 1 for _, of_class in points]
+    node, waiting = np.zeros(sizes), np.zeros(sizes)
+    if runs_straight(robot):
+        least = least_angles(robot, [extents(robot, i, *p) for i, p in enumerate(points)])
+        node = np.where(least.empty, np.inf, prices.bending * least.bending)
+        for angle, end in zip(least.angles, goal, strict=False):
+            excess = np.maximum(angle - end, 0.0) / max(float(end), STRAIGHT)
+            waiting = waiting + np.where(least.empty, 0.0, prices.waiting * excess)
+    if pairs_fit(points) and prices.bending > 0:
+        node = np.maximum(node, prices.bending * least_bending(robot, points))
+    return node, waiting
 
-    def _cheapest(self, node: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
-        """Cheapest path from every point of the grid to the origin, level by level."""
-        most = 1 if self._in_actions else int(self._lattice.reach.sum(axis=1).max())
-        value = np.full(node.shape, np.inf)
-        value[(0,) * node.ndim] = 0.0
-        points = np.indices(node.shape).reshape(node.ndim, -1)
-        total = points.sum(axis=0)
-        for level in range(1, int(total.max()) + 1):
-            here = points[:, total == level]
-            best = np.full(here.shape[1], np.inf)
-            for layer in range(node.ndim):
-                for taken in range(1, most + 1):
-                    after = here.copy()
-                    after[layer] = np.maximum(after[layer] - taken, 0)
-                    step = node[tuple(after)] + value[tuple(after)]
-                    best = np.minimum(best, np.where(here[layer] >= taken, step, np.inf))
-            value[tuple(here)] = best
-        return value
+
+def _cheapest(
+    node: Float[np.ndarray, "..."],
+    waiting: Float[np.ndarray, "..."],
+    price: float,
+    visits: Int[np.ndarray, " layers"],
+    most: int,
+) -> Float[np.ndarray, "..."]:
+    """Cost from every place, number of counted visits and combination of classes to the origin.
+
+    A step takes at most so much off a class, or one more out of "untouched", which is one more.
+    """
+    n, shape = node.ndim, node.shape
+    node, waiting = node.reshape(-1), waiting.reshape(-1)
+    strides = np.append(np.cumprod(shape[::-1])[::-1][1:], 1).astype(np.int64)
+    index = np.indices(shape).reshape(n, -1)
+    level_of = index.sum(axis=0)
+    order = np.argsort(level_of, kind="stable")
+    levels = np.split(order, np.cumsum(np.bincount(level_of))[:-1])
+    value = np.full((n + 1, *(visits + 1), node.size), np.inf)
+    value[..., 0] = 0.0
+    for here in levels[1:]:
+        stays = np.full((n, *(visits + 1), len(here)), np.inf)
+        elsewhere = np.full((*(visits + 1), len(here)), np.inf)
+        for layer in range(n):
+            for drop in range(1, most + 2):
+                untouched = index[layer, here] == shape[layer] - 1
+                may = (index[layer, here] >= drop) & ((drop <= most) | untouched)
+                after = np.where(may, here - drop * strides[layer], 0)
+                through = np.where(may, node[after], np.inf) + value[layer][..., after]
+                stays[layer] = np.minimum(stays[layer], through)
+                fewer = np.maximum(np.arange(visits[layer] + 1) - 1, 0)
+                entered = np.take(through, fewer, axis=layer)
+                beyond = np.moveaxis(entered, layer, 0)
+                beyond[0] += price
+                elsewhere = np.minimum(elsewhere, entered)
+        elsewhere = elsewhere + waiting[here]
+        value[:n, ..., here] = np.minimum(stays, elsewhere)
+        value[n][..., here] = elsewhere
+    return value.reshape(n + 1, *(visits + 1), *shape)

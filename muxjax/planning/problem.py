@@ -16,14 +16,14 @@ from types import MappingProxyType
 from typing import Annotated, Any, Literal
 
 import equinox as eqx
-import jax
 import numpy as np
 from jaxtyping import Float, Int
 from pydantic import Field
 
-from muxjax.collision import World, clearance
+from muxjax.collision import World
 from muxjax.config import Sourced, Strict, load_yaml, resolve
 from muxjax.kinematics import check_configuration
+from muxjax.planning.tension import Tension
 from muxjax.planning.terms import (
     TERMS,
     ByIdentity,
@@ -34,12 +34,13 @@ from muxjax.planning.terms import (
     is_expensive,
     step,
 )
-from muxjax.planning.world import Clearance, Collision
+from muxjax.planning.world import Clearance, Collision, clearance_of
 from muxjax.precision import host_array
 from muxjax.robot import Robot
 from muxjax.tendons import check_displacements, configuration_from_tendons
 
-ACTION_SETS = ("subsets", "all", "multistep")
+ACTION_SETS = ("subsets", "all", "multistep", "splits")
+ASSUMED_TENSION = Tension()  # unless a problem brings its own; one object compiles once
 COLLISION = "collision"  # the name under which a world's hard term stands among the weights
 
 __all__ = ["TERMS", "Plan", "PlanningError", "Problem", "Term", "Transition", "step"]
@@ -100,7 +101,11 @@ class Problem:
             ``"subsets"``: any non-empty subset of the tendons that the servos reach there, each by
             one step of the lattice; ``"all"``: all of them that still have to move (the paper's);
             ``"multistep"``: any subset, each tendon by any number of its remaining steps, in one
-            straight motion. In the first and the last a tendon may be visited more than once.
+            straight motion;
+            ``"splits"``: likewise without ``max_step``; only the longest tendon of a layer may
+            stop halfway, where it has gone, or has still to go, as far as another one of the
+            layer. Servos that wind side by side then lose no time.
+            In all but the second a tendon may be visited more than once.
 
     Raises:
         ValueError: A field that no robot could satisfy. What depends on the robot is checked by
@@ -143,6 +148,8 @@ class Problem:
                 f"Problem.action_set: must be one of {', '.join(ACTION_SETS)}, "
                 f"found {self.action_set!r}"
             )
+        if self.action_set == "splits" and self.max_step is not None:
+            raise ValueError("Problem.max_step: must be None with action_set 'splits'")
         if not isinstance(self.world, World | None):
             raise ValueError(f"Problem.world: must be a World or None, found {self.world!r}")
         self._check_weights()
@@ -187,7 +194,7 @@ class Problem:
         of_world: dict[str, Term] = {}
         if self.world is not None:
             of_world = {"clearance": Clearance(self.world), COLLISION: Collision(self.world)}
-        return {**TERMS, **of_world, **self.terms}
+        return {**TERMS, "tension": ASSUMED_TENSION, **of_world, **self.terms}
 
     @cached_property
     def weighted_terms(self) -> tuple[tuple[str, Term], ...]:
@@ -288,9 +295,7 @@ def check_ends(robot: Robot, start_name: str, start: Any, target_name: str, targ
 
 def _check_clear(robot: Robot, problem: Problem, world: World) -> None:
     for name in ("start", "target"):
-        q = configuration_from_tendons(robot, getattr(problem, name))
-        with jax.enable_x64(True):
-            distance = float(clearance(robot, q, world))
+        distance = clearance_of(robot, getattr(problem, name), world)
         if not distance >= 0.0:
             raise ValueError(
                 f"Problem.{name}: the arm is {-1e3 * distance:.3g} mm deep in an obstacle or itself"

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from muxjax.planning.axial import fewest_repositionings
-from muxjax.planning.bounds import AdmissibleBound
+from muxjax.planning.bounds import bound_of
 from muxjax.planning.lattice import Lattice
 from muxjax.planning.problem import Plan
 
@@ -63,13 +63,15 @@ def replay(
     )
     if not np.isfinite(cost):
         return failed(lattice, method=method, reason=_why(lattice, both), expansions=expansions)
-    if lower_bound is None:
-        lower_bound = float(AdmissibleBound(lattice)(*_start(lattice))[0])
+    if optimal:
+        lower_bound = cost
+    elif lower_bound is None:
+        lower_bound = float(bound_of(lattice)(*_start(lattice))[0])
     return Plan(
         displacements=displacements,
         axial=axial,
         cost=cost,
-        lower_bound=cost if optimal else min(cost, lower_bound),
+        lower_bound=min(cost, lower_bound),
         expansions=expansions,
         problem=lattice.problem,
         fingerprint=lattice.robot.fingerprint,
@@ -117,7 +119,7 @@ def failed(lattice: Lattice, *, method: str, reason: str, expansions: int) -> Pl
         displacements=lattice.problem.start[None],
         axial=np.zeros(0, dtype=np.int64),
         cost=float("inf"),
-        lower_bound=float(AdmissibleBound(lattice)(*_start(lattice))[0]),
+        lower_bound=float(bound_of(lattice)(*_start(lattice))[0]),
         expansions=expansions,
         problem=lattice.problem,
         fingerprint=lattice.robot.fingerprint,

@@ -35,10 +35,21 @@ def clearance_at(
     return clearance(robot, configuration_from_bending(b), world)
 
 
+def clearance_of(robot: Robot, displacements: Float[np.ndarray, " SJ"], world: World) -> float:
+    """``clearance_at`` of one state on the host, in float64."""
+    with jax.enable_x64(True):
+        return float(_compiled_clearance(robot, displacements, world))
+
+
+_compiled_clearance = eqx.filter_jit(clearance_at)
+
+
 def speed_bound(
-    robot: Robot, before: Float[Array, "*n SJ"], after: Float[Array, "*n SJ"]
+    robot: Robot, before: Float[Array, "*n SJ"], after: Float[Array, "*n SJ"], world: World
 ) -> Float[Array, "*n"]:
-    """Upper bound on how far any point of the arm goes in a leg, were it all at its fastest [m].
+    """Upper bound on how far any point goes in a leg, were it all at its fastest [m].
+
+    Points are those of the arm, its tool, and what the tool carries.
 
     While a segment's bending vector changes by db, its directions turn by at most |db| s / L at
     arc s; so no point moves by more than |db| (L / 2 + what is beyond the segment). The speed of b
@@ -49,8 +60,10 @@ def speed_bound(
     b = bending_from_displacements(robot, points)
     change = jnp.linalg.norm(jnp.diff(b, axis=-3), axis=-1)  # (*n, parts, S)
     length = jnp.asarray(robot.length)
-    tool = jnp.linalg.norm(jnp.asarray(robot.tool)[:3, 3])
-    lever = length / 2 + jnp.sum(length) - jnp.cumsum(length) + tool
+    tool, carried = jnp.asarray(robot.tool), jnp.asarray(world.carried)
+    beyond = jnp.concatenate([tool[None, :3, 3], carried @ tool[:3, :3].T + tool[:3, 3]])
+    reach = jnp.max(jnp.linalg.norm(beyond, axis=-1))
+    lever = length / 2 + jnp.sum(length) - jnp.cumsum(length) + reach
     return LEG_POINTS * jnp.max(change @ lever, axis=-1)
 
 
@@ -68,7 +81,7 @@ class Collision(eqx.Module):
     def __call__(self, robot: Robot, t: Transition) -> Float[Array, "*n"]:
         """The term's value."""
         before, move = t.before, t.after - t.before
-        speed = speed_bound(robot, before, t.after)
+        speed = speed_bound(robot, before, t.after, self.world)
         shortest = self.tolerance / jnp.maximum(speed, self.tolerance)
 
         def distance(fraction: jax.Array) -> jax.Array:

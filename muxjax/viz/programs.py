@@ -13,10 +13,10 @@ from matplotlib.animation import FuncAnimation, PillowWriter
 from matplotlib.figure import Figure
 
 from muxjax.kinematics import backbone
-from muxjax.metrics import Timeline, timeline
+from muxjax.metrics import timeline
 from muxjax.planning.motion import angles_at
 from muxjax.robot import Robot
-from muxjax.scheduler import Program
+from muxjax.scheduler import Program, Trajectory
 from muxjax.tendons import configuration_from_tendons
 
 # Okabe-Ito colours by segment, distinguishable without colour vision and, with the line styles
@@ -75,7 +75,7 @@ def compare_programs(
         _draw_lengths(lengths, robot, line)
         _draw_angles(angles, robot, line)
         lengths.set_title(
-            f"{name}\n{line.times[-1]:.1f} s, {len(program.instructions)} stages", fontsize=9
+            f"{name}\n{line.time_s[-1]:.1f} s, {len(program.instructions)} stages", fontsize=9
         )
         for axes in (lengths, angles):
             _shade_motion(axes, line)
@@ -90,14 +90,14 @@ def compare_programs(
     return _save(figure, path)
 
 
-def _draw_lengths(axes: Any, robot: Robot, line: Timeline) -> None:
+def _draw_lengths(axes: Any, robot: Robot, line: Trajectory) -> None:
     for c, values in enumerate(line.displacements.T):
         segment, tendon = divmod(c, robot.tendons_per_segment)
-        axes.plot(line.times, 1e3 * values, style(tendon), color=colour(segment), lw=1.2)
+        axes.plot(line.time_s, 1e3 * values, style(tendon), color=colour(segment), lw=1.2)
 
 
-def _draw_angles(axes: Any, robot: Robot, line: Timeline) -> None:
-    times = np.union1d(np.linspace(0, line.times[-1], 400), line.times)
+def _draw_angles(axes: Any, robot: Robot, line: Trajectory) -> None:
+    times = np.union1d(np.linspace(0, line.time_s[-1], 400), line.time_s)
     theta = np.degrees(angles_at(robot, line.at(times)))
     for segment, values in enumerate(theta.T):
         axes.plot(times, values, color=colour(segment), lw=1.4)
@@ -105,11 +105,11 @@ def _draw_angles(axes: Any, robot: Robot, line: Timeline) -> None:
     axes.set_ylim(bottom=0)
 
 
-def _shade_motion(axes: Any, line: Timeline) -> None:
+def _shade_motion(axes: Any, line: Trajectory) -> None:
     moving = np.any(np.diff(line.displacements, axis=0) != 0, axis=-1)
-    for begin, end in zip(line.times[:-1][moving], line.times[1:][moving], strict=True):
+    for begin, end in zip(line.time_s[:-1][moving], line.time_s[1:][moving], strict=True):
         axes.axvspan(begin, end, color="0.5", alpha=0.12, lw=0)
-    axes.set_xlim(0, max(line.times[-1], 1e-9))
+    axes.set_xlim(0, max(line.time_s[-1], 1e-9))
 
 
 def _legend(robot: Robot) -> tuple[list[Any], list[str]]:
@@ -212,7 +212,7 @@ def animate(
         seconds: Length of the animation; the true time stands in the picture.
     """
     line = timeline(robot, program)
-    times = np.linspace(0, line.times[-1], max(2, int(seconds * _FRAMES_A_SECOND)))
+    times = np.linspace(0, line.time_s[-1], max(2, int(seconds * _FRAMES_A_SECOND)))
     states = line.at(times)
     figure = Figure(figsize=(5, 5), layout="constrained")
     axes = figure.add_subplot(projection="3d")
@@ -237,9 +237,9 @@ def animate(
     return path
 
 
-def _moving_at(line: Timeline, time: float) -> list[int]:
+def _moving_at(line: Trajectory, time: float) -> list[int]:
     """Tendons, from 0, that move at a time."""
-    stretch = min(int(np.searchsorted(line.times, time, side="right")), len(line.times) - 1)
+    stretch = min(int(np.searchsorted(line.time_s, time, side="right")), len(line.time_s) - 1)
     step = line.displacements[stretch] - line.displacements[max(stretch - 1, 0)]
     return [int(c) for c in np.flatnonzero(step)]
 

@@ -219,7 +219,7 @@ def segments_of(robot: Robot, count: int) -> Robot:
     return robot_from_config(RobotConfig.model_validate(raw | {"segments": parts}))
 
 
-@pytest.mark.parametrize("count", [1, 2, 4, 5, 6])
+@pytest.mark.parametrize("count", [1, 2, 4, 5, pytest.param(6, marks=pytest.mark.slow)])
 def test_other_numbers_of_segments(muxarm, rng, count):
     robot = segments_of(muxarm, count)
     q = random_configurations(robot, rng, 4)

@@ -52,7 +52,9 @@ def test_by_the_pose(muxarm, axis):
     np.testing.assert_allclose(exact, numeric, rtol=1e-5, atol=1e-5)
 
 
-@pytest.mark.parametrize("segment", range(3))
+@pytest.mark.parametrize(
+    "segment", [0, pytest.param(1, marks=pytest.mark.slow), pytest.param(2, marks=pytest.mark.slow)]
+)
 def test_by_a_length(muxarm, segment):
     pose = independent.pose(muxarm, Q)
 
@@ -65,7 +67,7 @@ def test_by_a_length(muxarm, segment):
     np.testing.assert_allclose(exact, numeric, rtol=1e-5, atol=1e-4)
 
 
-@pytest.mark.parametrize("frame", ["base", "tool"])
+@pytest.mark.parametrize("frame", [pytest.param("base", marks=pytest.mark.slow), "tool"])
 def test_by_a_frame(muxarm, frame):
     pose = independent.pose(muxarm, Q)
 

@@ -13,7 +13,9 @@ from muxjax.scheduler import schedule
 FASTEST = {"time": 1.0, "overshoot": 1e-3}
 
 
-@pytest.mark.parametrize("servos", [(1, 2), (1, 3), (1, 2, 3)])
+@pytest.mark.parametrize(
+    "servos", [(1, 2), pytest.param((1, 3), marks=pytest.mark.slow), (1, 2, 3)]
+)
 def test_it_comes_close_to_what_no_program_can_fall_below(muxarm, rng, servos):
     start = np.zeros(muxarm.n_tendons)
     for target in random_targets(muxarm, rng, 3):

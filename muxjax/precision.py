@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import functools
 import inspect
+import os
 from collections.abc import Callable, Sequence
 from typing import Any, TypeVar
 
@@ -53,6 +54,13 @@ def pad_rows(rows: np.ndarray) -> np.ndarray:
     while size < len(rows):
         size *= 4
     return np.pad(rows, ((0, size - len(rows)), *((0, 0),) * (rows.ndim - 1)))
+
+
+def cores() -> int:
+    """Processor cores that this process may use: threads for the chunks of a batch."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
 
 
 def check_last_axis(name: str, shape: tuple[int, ...], last: int) -> None:

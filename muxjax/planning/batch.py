@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from typing import Any
@@ -15,7 +14,7 @@ from muxjax.planning import full_moves
 from muxjax.planning.exact import exact
 from muxjax.planning.lattice import Lattice
 from muxjax.planning.problem import Plan, Problem, check_ends, check_problem
-from muxjax.precision import host_array
+from muxjax.precision import cores, host_array
 from muxjax.robot import Robot
 
 _CHUNK = 16  # problems in one compiled call: their tables then stay in a core's cache
@@ -83,7 +82,7 @@ def plan_batch(robot: Robot, starts: Any, targets: Any, **fields: Any) -> PlanBa
             "meet one layer at an axial position"
         )
     chunks = [slice(i, i + _CHUNK) for i in range(0, len(goals), _CHUNK)]
-    with ThreadPoolExecutor(os.cpu_count()) as pool:
+    with ThreadPoolExecutor(cores()) as pool:
         parts = pool.map(lambda rows: _costs(robot, common, begins[rows], goals[rows]), chunks)
         cost = np.concatenate(list(parts))
     return PlanBatch(robot, common, begins, goals, cost)

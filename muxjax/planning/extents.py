@@ -55,15 +55,16 @@ def extents(
     least, longest = np.zeros(classes), np.zeros(classes)
     order = np.argsort(of_class, kind="stable")
     present, begins = np.unique(of_class[order], return_index=True)
-    furthest[present] = np.maximum.reduceat((harmonic @ _directions())[order], begins)
+    furthest[present] = np.maximum.reduceat((harmonic @ directions(_DIRECTIONS))[order], begins)
     least[present] = np.minimum.reduceat(norm[order], begins)
     longest[present] = np.maximum.reduceat(arc[order], begins)
     empty = ~np.isin(np.arange(classes), present)
     return Extents(empty, furthest, least, longest, order, begins, present, harmonic, arc)
 
 
-def _directions() -> Float[np.ndarray, "2 K"]:
-    angle = 2 * np.pi * np.arange(_DIRECTIONS) / _DIRECTIONS
+def directions(count: int) -> Float[np.ndarray, "2 K"]:
+    """Unit vectors all around."""
+    angle = 2 * np.pi * np.arange(count) / count
     return np.stack([np.cos(angle), np.sin(angle)])
 
 
@@ -129,13 +130,13 @@ def _slack(robot: Robot, layers: list[Extents]) -> list[float]:
 
 def _through(robot: Robot, layers: list[Extents], slack: list[float]) -> list[np.ndarray]:
     """Greatest extent of what passes on to the next layer: (C1, K), and (C1, C2, K)."""
-    directions, found = _directions(), list[np.ndarray]()
+    around, found = directions(_DIRECTIONS), list[np.ndarray]()
     if len(layers) > 1:
         one, length = layers[0], float(robot.length[0])
         mean = np.maximum(one.mean, 1e-9)
         angle = np.linalg.norm(one.harmonic, axis=-1) * length / (robot.tendon_radius * mean)
         kappa = length * np.sinc(angle / (2 * robot.n_discs[0]) / np.pi) / mean
-        found.append(one.most((kappa[:, None] * one.harmonic) @ directions))
+        found.append(one.most((kappa[:, None] * one.harmonic) @ around))
     if len(layers) > 2:
         two, length = layers[1], float(robot.length[1])
         sinc = 1.0 - (slack[2] - slack[1]) / length
@@ -144,7 +145,7 @@ def _through(robot: Robot, layers: list[Extents], slack: list[float]) -> list[np
         high = length / np.maximum(two.mean, 1e-9)
         # Own part and the rest apart: together they would need every class with every state.
         both = np.stack([low, high], axis=-1)
-        own = two.harmonic @ directions
+        own = two.harmonic @ around
         most = two.most(np.maximum(low[:, None] * own, high[:, None] * own))
         shares = two.most(1 - both).max(axis=-1), -two.most(both - 1).max(axis=-1)
         far = found[0][:, None]  # (C1, 1, K)

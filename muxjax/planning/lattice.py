@@ -47,42 +47,44 @@ class Lattice:
 
     @cached_property
     def steps(self) -> Int[np.ndarray, " SJ"]:
-        """n_c: steps of each tendon from the start. The tolerance guards the rounding."""
-        if self.problem.action_set == "splits":
-            return np.array([len(stops) for stops in self._splits])
-        residual = np.abs(self.problem.target - self.problem.start)
-        needed = np.ceil((residual - self.problem.tolerance) / self.max_step)
-        return np.maximum(needed, 0).astype(np.int64)
+        """n_c: steps of each tendon from the start."""
+        return np.array([len(stops) for stops in self._stops], dtype=np.int64)
 
     @cached_property
-    def _splits(self) -> list[list[float]]:
-        """Where each tendon may stop, as a way [m] from its start: its end last.
+    def _stops(self) -> list[Float[np.ndarray, " n"]]:
+        """Ways [m] from its start at which each tendon may stop: its end last."""
+        ways = np.abs(self.problem.target - self.problem.start)
+        if self.problem.action_set == "splits":
+            layers = ways.reshape(self.robot.n_segments, -1)
+            return [self._splits(way, layer) for layer in layers for way in layer]
+        # The tolerance guards the rounding.
+        needed = np.maximum(np.ceil((ways - self.problem.tolerance) / self.max_step), 0)
+        return [
+            np.minimum(np.arange(1, n + 1) * self.max_step, way)
+            for n, way in zip(needed, ways, strict=True)
+        ]
+
+    def _splits(self, way: float, layer: Float[np.ndarray, " J"]) -> Float[np.ndarray, " n"]:
+        """Stops of one tendon of a layer with these ways.
 
         Servos that wind two tendons of a layer lose no time while both go equally far, so its
         longest one may stop after another one's way, or with another one's way left to go.
         """
         tolerance = self.problem.tolerance
-        ways = np.abs(self.problem.target - self.problem.start)
-        splits = []
-        for layer in ways.reshape(self.robot.n_segments, -1):
-            for way in layer:
-                others = layer[layer < way] if way == max(layer) else layer[:0]
-                kept: list[float] = []
-                for stop in np.sort([*others, *(way - others)]):
-                    if min(stop - (kept[-1] if kept else 0.0), way - stop) > tolerance:
-                        kept.append(float(stop))
-                splits.append([*kept, float(way)] if way > tolerance else [])
-        return splits
+        if way <= tolerance:
+            return np.zeros(0)
+        others = layer[layer < way] if way == layer.max() else layer[:0]
+        kept = [0.0]
+        for stop in np.sort([*others, *(way - others)]):
+            if min(stop - kept[-1], way - stop) > tolerance:
+                kept.append(stop)
+        return np.array([*kept[1:], way])
 
     @cached_property
     def _made(self) -> Float[np.ndarray, "SJ most"]:
-        """Way [m] that each tendon has gone after k of its steps; behind its last, all of it."""
-        ways = np.abs(self.problem.target - self.problem.start)
-        if self.problem.action_set != "splits":
-            count = np.arange(self.steps.max() + 1)
-            return np.minimum(count * self.max_step, ways[:, None])
-        made = np.zeros((len(ways), self.steps.max() + 1))
-        for row, stops in zip(made, self._splits, strict=True):
+        """Way [m] that each tendon has gone after k of its steps; zero behind its last."""
+        made = np.zeros((len(self.steps), self.steps.max() + 1))
+        for row, stops in zip(made, self._stops, strict=True):
             row[1 : len(stops) + 1] = stops
         return made
 

@@ -13,6 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
+from muxjax.planning.extents import directions
 from muxjax.planning.grid import Rest, layered_angles, layered_rests
 from muxjax.robot import Robot
 
@@ -63,11 +64,6 @@ def _begins(of_class: Int[np.ndarray, " P"]) -> Int[np.ndarray, " C"]:
     return np.searchsorted(of_class, np.arange(of_class[-1] + 1))
 
 
-def _directions() -> Float[np.ndarray, "2 K"]:
-    angle = 2 * np.pi * np.arange(_DIRECTIONS) / _DIRECTIONS
-    return np.stack([np.cos(angle), np.sin(angle)])
-
-
 def _clouds(robot: Robot, layers: list[Points]) -> _Clouds:
     (one, classes), (two, others) = layers[:2]
     begins = _begins(others)
@@ -97,7 +93,7 @@ def _widen(found: _Clouds, number: int, rest: Rest, begins: Int[np.ndarray, " C"
     bad = ~np.isfinite(rest.arc[..., 0])
     arc = np.where(bad, -np.inf, rest.arc[..., 0]).max(axis=0)
     found.longest[number] = np.maximum(found.longest[number], np.maximum.reduceat(arc, begins))
-    for k, (dx, dy) in enumerate(_directions().T):
+    for k, (dx, dy) in enumerate(directions(_DIRECTIONS).T):
         along = -(dx * rest.mx + dy * rest.my)[..., 0]
         top = np.maximum.reduceat(np.where(bad, -np.inf, along).max(axis=0), begins)
         found.furthest[number, :, k] = np.maximum(found.furthest[number, :, k], top)
@@ -110,7 +106,7 @@ def _third(robot: Robot, points: Points, clouds: _Clouds) -> Float[np.ndarray, "
     _, straight = layered_rests(robot, [zero, zero, own], np)[-1]
     begins = _begins(of_class)
     longer = np.maximum.reduceat(straight.arc[0, 0] - robot.length[2], begins)
-    harmonic = np.stack([straight.mx[0, 0], straight.my[0, 0]], axis=-1) @ _directions()
+    harmonic = np.stack([straight.mx[0, 0], straight.my[0, 0]], axis=-1) @ directions(_DIRECTIONS)
     nearest = np.minimum.reduceat(harmonic, begins, axis=0)  # (C3, K)
     apart = np.full((*clouds.longest.shape, len(begins)), 0.0)
     for k in range(_DIRECTIONS):

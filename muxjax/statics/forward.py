@@ -6,7 +6,6 @@ for what the plain iteration did not solve, and the traced path with implicit de
 
 from __future__ import annotations
 
-import os
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any, cast, get_args
@@ -17,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from muxjax.precision import check_last_axis, host_array
+from muxjax.precision import check_last_axis, cores, host_array
 from muxjax.statics import kernel as kn
 from muxjax.statics.chain import ElasticChain
 from muxjax.statics.checks import check_chain, check_given
@@ -201,13 +200,6 @@ def _solve_chunks(
             parts.extend(pool.map(chunk, firsts[1:]))
     columns = zip(*parts, strict=True)
     return Solution(*(np.concatenate(column, axis=-1)[..., :rows] for column in columns))
-
-
-def cores() -> int:
-    """Processor cores that this process may use."""
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
 
 
 def _solve_rows(

@@ -17,13 +17,13 @@ import jax
 import numpy as np
 
 import muxjax
-from muxjax.collision import World, load_world, tightest
+from muxjax.collision import World, load_world
 from muxjax.config import TaskConfig, load_yaml, resolve
 from muxjax.ik import solve_ik
+from muxjax.ik.clear import nearest
 from muxjax.ik.every import polar
 from muxjax.ik.goals import tool_goals
 from muxjax.ik.levenberg import levenberg
-from muxjax.precision import pad_rows
 from muxjax.robot import Robot
 from tests.benchmarks.common import machine, table
 
@@ -34,14 +34,6 @@ TOLERANCE = 1e-10  # [m] and [rad]
 
 Part = tuple[Robot, np.ndarray]  # an arm on its base, and configurations
 
-_look = jax.jit(tightest)
-
-
-def clearance_of(robot: Robot, q: np.ndarray, world: World) -> np.ndarray:
-    """In float64 [m]."""
-    with jax.enable_x64(True):
-        return np.asarray(_look(robot, pad_rows(q), world).clearance)[: len(q)]
-
 
 def random_clear(robot: Robot, world: World, count: int, rng: np.random.Generator) -> np.ndarray:
     """Uniform in theta and phi, among those that are clear."""
@@ -50,7 +42,7 @@ def random_clear(robot: Robot, world: World, count: int, rng: np.random.Generato
         theta = rng.uniform(0, robot.theta_max, (4 * count, robot.n_segments))
         phi = rng.uniform(0, 2 * np.pi, theta.shape)
         q = np.stack([theta, phi], axis=-1).reshape(len(theta), -1)
-        kept.append(q[clearance_of(robot, q, world) >= 0])
+        kept.append(q[nearest(robot, q, world).clearance >= 0])
     return np.concatenate(kept)[:count]
 
 
@@ -62,7 +54,7 @@ def scattered_clear(
     while sum(map(len, kept)) < count:
         q = about + SCATTER * rng.normal(size=(4 * count, len(about)))
         q[:, 0::2] = np.clip(q[:, 0::2], 0, robot.theta_max)
-        kept.append(q[clearance_of(robot, q, world) >= 0])
+        kept.append(q[nearest(robot, q, world).clearance >= 0])
     return np.concatenate(kept)[:count]
 
 
@@ -80,7 +72,7 @@ def random_search(
             goal = np.repeat(tool_goals(host, pose[None]), starts, axis=1)
             found = levenberg(host, b, b, goal, np.ones(6), STEPS)
         there = (found.position < TOLERANCE) & (found.angle < TOLERANCE)
-        clear = clearance_of(robot, polar(host, found.b.T), world) >= 0
+        clear = nearest(robot, polar(host, found.b.T), world).clearance >= 0
         success[row] = bool((there & clear).any())
     return success
 
@@ -133,7 +125,7 @@ def main() -> None:
             cpu += time.process_time() - start
             clear.append(found.converged)
             near = solve_ik(arm, poses)
-            nearest_clear.append(clearance_of(arm, near.q, world) >= 0)
+            nearest_clear.append(nearest(arm, near.q, world).clearance >= 0)
             few = rng.permutation(len(poses))[: -(-options.searched // len(parts))]
             random_search(arm, poses[few[:1]], world, options.starts, rng)
             start = time.process_time()

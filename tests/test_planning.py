@@ -22,6 +22,7 @@ from muxjax.planning.lattice import Lattice
 from muxjax.planning.motion import angles_at, leg_time, relative_excess
 from muxjax.planning.table import LatticeTable
 from muxjax.robot import Robot
+from tests.beam_oracle import beam
 
 GOLDEN = Path(__file__).parent / "golden"
 SERVO_SETS = [s for n in (1, 2, 3) for s in combinations((1, 2, 3), n)]
@@ -257,6 +258,38 @@ def test_a_wide_beam_is_exact_and_certifies_itself(muxarm, rng):
         assert wide.cost == pytest.approx(plan(muxarm, problem).cost, rel=1e-12)
 
 
+@pytest.mark.parametrize("action_set", ["subsets", "all", "multistep", "splits"])
+def test_the_compiled_beam_is_the_one_on_the_host(muxarm, rng, action_set):
+    """Whatever the width, the servos and the weights, as long as these leave no two plans equal."""
+    weights = {"travel": 1.0, "bending": 0.005, "switches": 0.05, "overshoot": 0.0137}
+    for number, target in enumerate(random_targets(muxarm, rng, 7)):
+        problem = Problem(
+            0.2 * (number % 2) * target,
+            target,
+            servos=SERVO_SETS[number % len(SERVO_SETS)],
+            max_step=None if action_set == "splits" else (0.03, 0.015)[number % 2],
+            weights=weights,
+            action_set=action_set,
+            axial=(None, 4)[number // 2 % 2],
+        )
+        lattice, width = Lattice(muxarm, problem), (7, 50)[number % 2]
+        known = min(plan(muxarm, problem, m).cost for m in ("sequential", "reverse", "greedy"))
+        cost, cut_off, _ = beam(lattice, width, known)
+        found = plan(muxarm, problem, "beamstep", width=width)
+        assert found.cost == pytest.approx(cost, rel=1e-12)
+        assert found.lower_bound == pytest.approx(min(cost, cut_off), rel=1e-12)
+
+
+@pytest.mark.parametrize("heuristic", ["none", "count", "patterns"])
+def test_every_heuristic_certifies(muxarm, rng, heuristic):
+    target = random_targets(muxarm, rng, 1)[0]
+    problem = Problem(np.zeros(9), target, servos=(1, 2), max_step=0.03)
+    best = plan(muxarm, problem).cost
+    found = plan(muxarm, problem, "beamstep", width=16, heuristic=heuristic)
+    assert found.lower_bound <= best * (1 + 1e-12)
+    assert best <= found.cost * (1 + 1e-12)
+
+
 def test_a_value_function_guides_but_cannot_break_the_certificate(muxarm, rng):
     target = random_targets(muxarm, rng, 1)[0]
     problem = Problem(np.zeros(9), target, servos=(1, 2))
@@ -266,7 +299,7 @@ def test_a_value_function_guides_but_cannot_break_the_certificate(muxarm, rng):
         problem,
         "beamstep",
         width=4,
-        value_fn=lambda state, axial: -1e3 * np.abs(state).sum(axis=1),
+        value_fn=lambda state, axial, bound: -1e3 * abs(state).sum(axis=1),
     )
     assert perverse.lower_bound <= best <= perverse.cost
 
@@ -449,7 +482,7 @@ def test_unknown_methods_and_options_are_refused(muxarm):
     with pytest.raises(ValueError, match="exact: has no option gap"):
         plan(muxarm, problem, "exact", gap=0.1)
     for method in ("beamstep", "beamstep_printed"):
-        with pytest.raises(ValueError, match="width: must be a whole number, at least 1"):
+        with pytest.raises(ValueError, match=r"width: must be a whole number(, at least 1| from 1 to 65536)"):
             plan(muxarm, problem, method, width=0)
 
 

@@ -7,41 +7,39 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from itertools import count
 from time import monotonic
+from typing import Any
 
+import jax
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Int
 
+from muxjax.planning.arrays import bound_arrays, lattice_arrays, level_room
 from muxjax.planning.baselines import greedy, reverse, sequential
-from muxjax.planning.bounds import AdmissibleBound, bound_of
 from muxjax.planning.lattice import Lattice
-from muxjax.planning.problem import Plan
+from muxjax.planning.problem import Plan, PlanningError
 from muxjax.planning.replay import Step, failed, replay
+from muxjax.planning.search import Found, search
+from muxjax.planning.terms import traced
 
-ValueFunction = Callable[
-    [Float[np.ndarray, "N SJ"], Int[np.ndarray, " N"]], Float[np.ndarray, " N"]
-]
-"""Estimated cost to go of states: displacements [m] and axial position (from 1, 0 = unknown)."""
-
-
-@dataclass(frozen=True)
-class _Level:
-    """Partial plans of equal length; arrays with a row each."""
-
-    remaining: Int[np.ndarray, "N SJ"]
-    stop: Int[np.ndarray, " N"]
-    cost: Float[np.ndarray, " N"]
-    parent: Int[np.ndarray, " N"]  # row in the level above
-    moves: Int[np.ndarray, "N SJ"]  # steps of each tendon in the last action
-
-    def take(self, rows: Int[np.ndarray, " M"]) -> _Level:
-        return _Level(*(getattr(self, name)[rows] for name in self.__dataclass_fields__))
+HEURISTICS = ("patterns", "count", "none")
+_ROOMS = (
+    1,
+    16,
+    64,
+    256,
+    1024,
+    4096,
+    16384,
+    65536,
+)  # for the plans of a level: one compilation each
 
 
 def beamstep(
     lattice: Lattice,
     *,
     width: int = 64,
-    value_fn: ValueFunction | None = None,
+    heuristic: str = "patterns",
+    value_fn: Callable[..., Any] | None = None,
     gap: float | None = None,
     deadline_s: float | None = None,
 ) -> Plan:
@@ -53,53 +51,63 @@ def beamstep(
     Args:
         lattice: The problem on the robot.
         width: Partial plans kept at each length, B; the first one where it is doubled.
-        value_fn: Orders the plans of a level instead of the admissible bound; it enters neither
-            the pruning nor the certificate.
+        heuristic: Admissible bound that orders, prunes and certifies: "patterns" (all that
+            ``bounds.py`` knows), "count" (stops, travel and time still needed) or "none".
+        value_fn: Orders the most promising plans of a level (``search.ValueFunction``); it enters
+            neither the pruning nor the certificate.
         gap: Double the width until the certified gap is no larger than this.
         deadline_s: Double the width as long as no more than this time [s] has passed; a search
             that was begun is finished.
 
     Raises:
-        ValueError: A width below 1, or a gap or deadline that is not a number of at least 0.
+        ValueError: A width below 1 or too large, an unknown heuristic, or a gap or deadline that
+            is not a number of at least 0.
+        PlanningError: A cost term is negative.
     """
-    _check_options(width, gap, deadline_s)
+    _check_options(width, heuristic, gap, deadline_s)
     began = monotonic()
-    bound = bound_of(lattice)
     incumbent = min((rule(lattice) for rule in (sequential, reverse, greedy)), key=lambda p: p.cost)
-    best = _Incumbent(incumbent.cost, None)
+    cost, steps = incumbent.cost, None
     proved, expansions = 0.0, 0
+    run = _prepared(lattice, heuristic, value_fn)
     while True:
-        cut_off, expanded = _search(lattice, bound, width, value_fn, best)
-        proved, expansions = max(proved, cut_off), expansions + expanded
-        tight = proved >= best.cost or (gap is not None and best.cost - proved <= gap * best.cost)
+        found = run(width, cost)
+        if found.negative:
+            raise PlanningError("a cost term is negative; terms must be at least 0")
+        if found.length:
+            cost, steps = float(found.cost), _trace(lattice, found)
+        proved = max(proved, min(float(found.cut_off), cost))
+        expansions += int(found.expansions)
+        tight = proved >= cost or (gap is not None and cost - proved <= gap * cost)
         late = deadline_s is not None and monotonic() - began >= deadline_s
-        if tight or late or (gap is None and deadline_s is None):
+        if tight or late or (gap is None and deadline_s is None) or 2 * width > _ROOMS[-1]:
             break
         width *= 2
-    if not np.isfinite(best.cost):
+    if not np.isfinite(cost):
         return _none_found(lattice, width, proved, expansions)
-    optimal = proved >= best.cost
-    if best.steps is None:
+    if steps is None:
         return replace(
             incumbent,
             method="beamstep",
-            lower_bound=min(best.cost, proved),
+            lower_bound=proved,
             expansions=expansions,
-            status="optimal" if optimal else "feasible",
+            status="optimal" if proved >= cost else "feasible",
         )
     return replay(
         lattice,
-        best.steps,
+        steps,
         method="beamstep",
         lower_bound=proved,
         expansions=expansions,
-        optimal=optimal,
+        optimal=proved >= cost,
     )
 
 
-def _check_options(width: int, gap: float | None, deadline_s: float | None) -> None:
-    if not isinstance(width, int) or width < 1:
-        raise ValueError(f"width: must be a whole number, at least 1, found {width!r}")
+def _check_options(width: int, heuristic: str, gap: float | None, deadline_s: float | None) -> None:
+    if not isinstance(width, int) or not 1 <= width <= _ROOMS[-1]:
+        raise ValueError(f"width: must be a whole number from 1 to {_ROOMS[-1]}, found {width!r}")
+    if heuristic not in HEURISTICS:
+        raise ValueError(f"heuristic: must be one of {', '.join(HEURISTICS)}, found {heuristic!r}")
     for name, value in (("gap", gap), ("deadline_s", deadline_s)):
         if value is not None and not value >= 0.0:
             raise ValueError(f"{name}: must be at least 0, found {value!r}")
@@ -116,110 +124,48 @@ def _none_found(lattice: Lattice, width: int, proved: float, expansions: int) ->
     return failed(lattice, method="beamstep", reason=reason, expansions=expansions)
 
 
-@dataclass
-class _Incumbent:
-    """The best plan so far; no steps if it is a baseline's."""
+def _prepared(
+    lattice: Lattice, heuristic: str, value_fn: Callable[..., Any] | None
+) -> Callable[[int, float], Found]:
+    """The compiled search of a lattice, for any width and any plan to better."""
+    terms, weights = lattice.problem.compiled_terms(expensive=False)
+    expensive, their_weights = lattice.problem.compiled_terms(expensive=True)
+    with jax.enable_x64(True):
+        data = jax.device_put((lattice_arrays(lattice), bound_arrays(lattice, heuristic)))
+    value = None if value_fn is None else traced(value_fn)
 
-    cost: float
-    steps: list[Step] | None
+    def run(width: int, best: float) -> Found:
+        with jax.enable_x64(True):
+            found = search(
+                lattice.robot,
+                terms,
+                weights,
+                expensive,
+                their_weights,
+                *data,
+                value,
+                np.int32(width),
+                np.float64(best),
+                rows=next(room for room in _ROOMS if room >= width),
+                levels=level_room(lattice),
+            )
+            return jax.device_get(found)
 
-
-def _search(
-    lattice: Lattice,
-    bound: AdmissibleBound,
-    width: int,
-    value_fn: ValueFunction | None,
-    best: _Incumbent,
-) -> tuple[float, int]:
-    """One beam; improves ``best`` and returns the least promise cut off, and its expansions."""
-    cut_off, expansions = float("inf"), 0
-    levels = [_root(lattice)]
-    while levels[-1].remaining.any():
-        expansions += len(levels[-1].cost)
-        children = _children(lattice, levels[-1], first=len(levels) == 1)
-        asked = np.full(len(children.cost), not lattice.has_expensive_terms)
-        while True:
-            rows = _deduplicated(children)
-            level = children.take(rows)
-            done = ~level.remaining.any(axis=1)
-            promise = level.cost + bound(level.remaining, level.stop)
-            hopeful = np.flatnonzero(~done & (promise < best.cost))
-            order = promise
-            if value_fn is not None:
-                order = level.cost + _values(lattice, level, value_fn)
-            ranked = hopeful[np.argsort(order[hopeful], kind="stable")]
-            arriving = np.flatnonzero(done & (level.cost < best.cost))
-            unsure = rows[np.concatenate([ranked[:width], arriving])]
-            unsure = unsure[~asked[unsure]]
-            if not len(unsure):
-                break
-            asked[unsure] = True
-            first = len(levels) == 1
-            children.cost[unsure] += _expensive(lattice, levels[-1], children.take(unsure), first)
-        if len(arriving):
-            row = arriving[np.argmin(level.cost[arriving])]
-            best.cost, best.steps = float(level.cost[row]), _trace([*levels, level], int(row))
-        cut_off = min(cut_off, float(np.min(promise[ranked[width:]], initial=np.inf)))
-        levels.append(level.take(ranked[:width]))
-    return cut_off, expansions
+    return run
 
 
-def _expensive(
-    lattice: Lattice, parents: _Level, children: _Level, first: bool
-) -> Float[np.ndarray, " N"]:
-    """What the expensive terms add to the last steps of these plans."""
-    before = children.remaining + children.moves
-    both = lattice.costs(before, children.moves, first=first, expensive=True)
-    stays = children.stop == parents.stop[children.parent]
-    return np.where(stays, both[:, 0], both[:, 1])
-
-
-def _root(lattice: Lattice) -> _Level:
-    return _Level(
-        remaining=lattice.steps[None],
-        stop=np.array([lattice.start_stop]),
-        cost=np.zeros(1),
-        parent=np.zeros(1, dtype=np.int64),
-        moves=np.zeros((1, len(lattice.steps)), dtype=np.int64),
-    )
-
-
-def _children(lattice: Lattice, level: _Level, *, first: bool) -> _Level:
-    """Every possible step from every plan of a level; ``first`` if these plans are still empty."""
-    stops, _ = lattice.actions
-    possible, moves = lattice.expand(level.remaining)
-    row, action = np.nonzero(possible)
-    moved, stop = moves[row, action], stops[action]
-    both = lattice.costs(level.remaining[row], moved, first=first)
-    return _Level(
-        remaining=level.remaining[row] - moved,
-        stop=stop,
-        cost=level.cost[row] + np.where(stop == level.stop[row], both[:, 0], both[:, 1]),
-        parent=row,
-        moves=moved,
-    )
-
-
-def _deduplicated(level: _Level) -> Int[np.ndarray, " M"]:
-    """Rows of the cheapest plan to each state."""
-    by_cost = np.argsort(level.cost, kind="stable")
-    states = np.column_stack([level.remaining, level.stop])[by_cost]
-    keys = np.ascontiguousarray(states).view(np.dtype((np.void, states.itemsize * states.shape[1])))
-    _, first = np.unique(keys.ravel(), return_index=True)
-    return by_cost[np.sort(first)]
-
-
-def _values(lattice: Lattice, level: _Level, value_fn: ValueFunction) -> Float[np.ndarray, " N"]:
-    axial = np.where(level.stop >= 0, lattice.axial_of(level.stop), 0)
-    return value_fn(lattice.displacements(level.remaining), axial)
-
-
-def _trace(levels: list[_Level], row: int) -> list[Step]:
-    steps: list[Step] = []
-    for level in reversed(levels[1:]):
-        steps.append(Step(int(level.stop[row]), level.moves[row]))
-        row = int(level.parent[row])
-    return steps[::-1]
+def _trace(lattice: Lattice, found: Found) -> list[Step]:
+    """The steps of the plan that was found."""
+    actions, row = [int(found.action)], int(found.parent)
+    for level in reversed(range(int(found.length) - 1)):
+        actions.append(int(found.actions[level, row]))
+        row = int(found.parents[level, row])
+    stops, counts = lattice.actions
+    remaining, steps = lattice.steps, list[Step]()
+    for action in reversed(actions):
+        steps.append(Step(int(stops[action]), np.minimum(counts[action], remaining)))
+        remaining = remaining - steps[-1].moves
+    return steps
 
 
 @dataclass(frozen=True)
@@ -279,20 +225,16 @@ def beamstep_printed(lattice: Lattice, *, width: int = 64, max_expansions: int =
 
 
 def _successors(lattice: Lattice, node: _Node) -> list[_Node]:
-    parent = _Level(
-        remaining=node.remaining[None],
-        stop=np.array([node.stop]),
-        cost=np.array([node.cost]),
-        parent=np.zeros(1, dtype=np.int64),
-        moves=np.zeros((1, len(node.remaining)), dtype=np.int64),
-    )
+    stops, _ = lattice.actions
+    possible, moves = lattice.expand(node.remaining[None])
+    actions = np.flatnonzero(possible[0])
+    moved, before = moves[0, actions], np.repeat(node.remaining[None], len(actions), axis=0)
     first = not node.steps
-    level = _children(lattice, parent, first=first)
-    costs = level.cost + _expensive(lattice, parent, level, first)
+    both = lattice.costs(before, moved, first=first)
+    both = both + lattice.costs(before, moved, first=first, expensive=True)
+    costs = node.cost + np.where(stops[actions] == node.stop, both[:, 0], both[:, 1])
     return [
-        _Node(remaining, int(stop), float(cost), (*node.steps, Step(int(stop), moves)))
-        for remaining, stop, cost, moves in zip(
-            level.remaining, level.stop, costs, level.moves, strict=True
-        )
+        _Node(node.remaining - m, int(stop), float(cost), (*node.steps, Step(int(stop), m)))
+        for stop, m, cost in zip(stops[actions], moved, costs, strict=True)
         if np.isfinite(cost)
     ]

@@ -31,7 +31,7 @@ class AdmissibleBound:
         self._lattice = lattice
         problem = lattice.problem
         # A user's term may take the name of a shipped one; no bound is known for it.
-        self._weights = {
+        self.weights = {
             name: problem.cost_weights[name]
             for name, term in problem.weighted_terms
             if term is TERMS.get(name)
@@ -49,20 +49,21 @@ class AdmissibleBound:
             "travel": residual.sum(axis=-1),
             "switches": stops,
             "time": stops * float(self._lattice.robot.switch_time) + self._motion_time(residual),
-            "bending": unfinished.any(axis=-1) * float(np.sum(self._end_angles**2)),
+            "bending": unfinished.any(axis=-1) * float(np.sum(self.end_angles**2)),
         }
         total = np.zeros(len(remaining))
-        for name, weight in self._weights.items():
+        for name, weight in self.weights.items():
             if name in by_term:
                 total = total + weight * by_term[name]
-        more = known = self._weights.get("bending", 0.0) * by_term["bending"]
-        for pattern in self._patterns:
+        more = known = self.weights.get("bending", 0.0) * by_term["bending"]
+        for pattern in self.patterns:
             more = np.maximum(more, pattern(remaining, stop, visits))
         return total + (more - known)
 
     @cached_property
-    def _patterns(self) -> list[VisitPattern]:
-        robot, weights = self._lattice.robot, self._weights
+    def patterns(self) -> list[VisitPattern]:
+        """Pattern databases; none where neither bending nor overshoot counts."""
+        robot, weights = self._lattice.robot, self.weights
         if not (weights.get("bending") or weights.get("overshoot")):
             return []
         seconds = float(robot.switch_time)
@@ -84,7 +85,8 @@ class AdmissibleBound:
         return self._lattice.displacements(np.zeros_like(self._lattice.steps))
 
     @cached_property
-    def _end_angles(self) -> Float[np.ndarray, " S"]:
+    def end_angles(self) -> Float[np.ndarray, " S"]:
+        """Bending angles [rad] where clipped moves end."""
         return angles_at(self._lattice.robot, self._end[None])[0]
 
     def _by_layer(self, values: np.ndarray) -> np.ndarray:

@@ -30,9 +30,9 @@ from muxjax.planning.terms import (
     CostTerm,
     Term,
     Transition,
-    cost_term,
     is_expensive,
     step,
+    traced,
 )
 from muxjax.planning.world import Clearance, Collision, clearance_of
 from muxjax.precision import host_array
@@ -214,7 +214,7 @@ class Problem:
     ) -> tuple[tuple[CostTerm, ...], Float[np.ndarray, " T"]]:
         """Those terms that are, or are not, expensive, as compiled functions take them; weights."""
         chosen = [
-            (cost_term(self._known_terms[name]), self.cost_weights[name])
+            (traced(self._known_terms[name]), self.cost_weights[name])
             for name in sorted(self.cost_weights)
             if is_expensive(self._known_terms[name]) == expensive
         ]

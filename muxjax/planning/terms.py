@@ -100,20 +100,23 @@ class ByIdentity:
         return self.term(robot, t)
 
 
-class CostTerm(eqx.Module):
-    """A term in a form that compiled functions take: arrays traced, all else static."""
+class Traced(eqx.Module):
+    """A function in a form that compiled ones take: its arrays traced, all else static."""
 
     arrays: Any
     rest: Any = eqx.field(static=True)
 
-    def __call__(self, robot: Robot, t: Transition) -> Float[Array, "*n"]:
-        """The term's value."""
-        return eqx.combine(self.arrays, self.rest)(robot, t)
+    def __call__(self, *args: Any) -> Any:
+        """The function's value."""
+        return eqx.combine(self.arrays, self.rest)(*args)
 
 
-def cost_term(term: Term) -> CostTerm:
-    """Separate what is traced in a term from what selects the compiled code."""
-    return CostTerm(*eqx.partition(term, _is_traced))
+CostTerm = Traced  # called with (robot, transition)
+
+
+def traced(function: Callable[..., Any]) -> Traced:
+    """Separate what is traced in a function from what selects the compiled code."""
+    return Traced(*eqx.partition(function, _is_traced))
 
 
 def _is_traced(leaf: object) -> bool:
@@ -131,7 +134,7 @@ def is_expensive(term: Term) -> bool:
 
 def step(
     robot: Robot,
-    displacements: Float[Array, "*n SJ"],
+    displacements: Float[Array, "*#n SJ"],
     move: Float[Array, "*n SJ"],
     repositions: Float[Array, "*n"],
     engages: Float[Array, "*n"],
@@ -141,22 +144,24 @@ def step(
 
     Args:
         robot: The arm.
-        displacements: Before the step [m].
+        displacements: Before the step [m]; axes of size 1 are shared by the moves along them.
         move: Displacement of each tendon [m].
         repositions: 1 where the axial motor moves first, else 0.
         engages: 1 where clutches engage at the position where the drum already stands, else 0.
         goal: Bending angles of the target [rad].
     """
     after = displacements + move
+    theta_before = bending_angles(robot, displacements)
+    before = jnp.broadcast_to(displacements, after.shape)
     return Transition(
-        before=displacements,
+        before=before,
         after=after,
         repositions=repositions,
         wait=waiting_time(robot, repositions, engages),
         goal=goal,
-        theta_before=bending_angles(robot, displacements),
+        theta_before=jnp.broadcast_to(theta_before, (*after.shape[:-1], theta_before.shape[-1])),
         theta_after=bending_angles(robot, after),
-        theta_along=angles_along(robot, displacements, after),
+        theta_along=angles_along(robot, before, after),
     )
 
 

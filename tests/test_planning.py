@@ -299,7 +299,7 @@ def test_a_value_function_guides_but_cannot_break_the_certificate(muxarm, rng):
         problem,
         "beamstep",
         width=4,
-        value_fn=lambda state, axial, bound: -1e3 * abs(state).sum(axis=1),
+        value_fn=lambda states: -1e3 * abs(states.displacements).sum(axis=1),
     )
     assert perverse.lower_bound <= best <= perverse.cost
 

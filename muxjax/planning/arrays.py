@@ -61,6 +61,15 @@ class PatternArrays(NamedTuple):
     state: Int[Array, "S P"]  # of a layer's state
 
 
+class Needs(NamedTuple):
+    """What is still needed, by layer; arrays with a row a state."""
+
+    way: list[Float[Array, " N"]]  # of all its tendons [m]
+    shortest: list[Float[Array, " N"]]  # of the servos, if they could always work together [m]
+    visits: list[Int[Array, " N"]]  # beyond the present one
+    state: list[Int[Array, " N"]]  # number of the layer's state
+
+
 class BoundArrays(NamedTuple):
     """``bounds.AdmissibleBound`` of a lattice: weights, and what they multiply."""
 
@@ -74,38 +83,41 @@ class BoundArrays(NamedTuple):
     layer_index: Int[Array, "S J"]  # of a remaining step in a layer's states
     patterns: tuple[PatternArrays, ...]
 
+    def needs(
+        self, lattice: LatticeArrays, remaining: Int[Array, "N SJ"], stop: Int[Array, " N"]
+    ) -> Needs:
+        """What states need by layer, or by what else may share a step."""
+        # A column a tendon: whole rows of memory for the compiler, which short axes are not.
+        left, here = remaining.T, self.reach[stop].T
+        way = [jnp.abs(lattice.way[c][k]) for c, k in enumerate(left)]
+        per_layer = self.layer_index.shape[1]
+        needs = Needs([], [], [], [])
+        for index, first in zip(self.layer_index, range(0, len(way), per_layer), strict=True):
+            tendons = range(first, first + per_layer)
+            needs.way.append(sum(way[c] for c in tendons))
+            longest = reduce(jnp.maximum, [way[c] for c in tendons])
+            needs.shortest.append(jnp.maximum(longest, needs.way[-1] / self.servos))
+            elsewhere = sum(((left[c] > 0) & ~here[c]).astype(stop.dtype) for c in tendons)
+            needs.visits.append(-(-elsewhere // self.servos))
+            needs.state.append(sum(left[c] * index[c - first] for c in tendons))
+        return needs
+
     def __call__(
         self, lattice: LatticeArrays, remaining: Int[Array, "N SJ"], stop: Int[Array, " N"]
     ) -> Float[Array, " N"]:
         """Bound at states."""
-        # A column a tendon: whole rows of memory for the compiler, which short axes are not.
-        left = remaining.T
-        here = self.reach[stop].T
-        way = [jnp.abs(lattice.way[c][k]) for c, k in enumerate(left)]
-        per_layer = self.layer_index.shape[1]
-        visits, states = list[Array](), list[Array]()
-        total: Array = 0.0
-        shortest: Array = 0.0
-        for index, first in zip(self.layer_index, range(0, len(way), per_layer), strict=True):
-            tendons = range(first, first + per_layer)
-            own = sum(way[c] for c in tendons)
-            total = total + own
-            longest = reduce(jnp.maximum, [way[c] for c in tendons])
-            shortest = shortest + jnp.maximum(longest, own / self.servos)
-            elsewhere = sum(((left[c] > 0) & ~here[c]).astype(stop.dtype) for c in tendons)
-            visits.append(-(-elsewhere // self.servos))
-            states.append(sum(left[c] * index[c - first] for c in tendons))
+        needs = self.needs(lattice, remaining, stop)
         more = self.bending * jnp.any(remaining > 0, axis=-1)
         for pattern in self.patterns:
             at = pattern.place[stop]
-            for layer, (count, state) in enumerate(zip(visits, states, strict=True)):
+            for layer, (count, state) in enumerate(zip(needs.visits, needs.state, strict=True)):
                 counted = jnp.minimum(count, pattern.visits[layer])
                 at = at + counted * pattern.visit[layer] + pattern.state[layer][state]
             more = jnp.maximum(more, pattern.value[at])
         return (
-            self.travel * total
-            + self.stop * sum(visits)
-            + self.second * shortest / self.speed
+            self.travel * sum(needs.way)
+            + self.stop * sum(needs.visits)
+            + self.second * sum(needs.shortest) / self.speed
             + more
         )
 

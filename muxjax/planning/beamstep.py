@@ -7,7 +7,6 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from itertools import count
 from time import monotonic
-from typing import Any
 
 import jax
 import numpy as np
@@ -18,7 +17,7 @@ from muxjax.planning.baselines import greedy, reverse, sequential
 from muxjax.planning.lattice import Lattice
 from muxjax.planning.problem import Plan, PlanningError
 from muxjax.planning.replay import Step, failed, replay
-from muxjax.planning.search import Found, search
+from muxjax.planning.search import Found, ValueFunction, search
 from muxjax.planning.terms import traced
 
 HEURISTICS = ("patterns", "count", "none")
@@ -39,7 +38,7 @@ def beamstep(
     *,
     width: int = 64,
     heuristic: str = "patterns",
-    value_fn: Callable[..., Any] | None = None,
+    value_fn: ValueFunction | None = None,
     gap: float | None = None,
     deadline_s: float | None = None,
 ) -> Plan:
@@ -125,7 +124,7 @@ def _none_found(lattice: Lattice, width: int, proved: float, expansions: int) ->
 
 
 def _prepared(
-    lattice: Lattice, heuristic: str, value_fn: Callable[..., Any] | None
+    lattice: Lattice, heuristic: str, value_fn: ValueFunction | None
 ) -> Callable[[int, float], Found]:
     """The compiled search of a lattice, for any width and any plan to better."""
     terms, weights = lattice.problem.compiled_terms(expensive=False)

@@ -23,11 +23,19 @@ from muxjax.robot import Robot
 
 Array = Any  # jax.Array | np.ndarray; mypy knows no operators of their union
 
-ValueFunction = Callable[
-    [Float[Array, "N SJ"], Int[Array, " N"], Float[Array, " N"]], Float[Array, " N"]
-]
-"""Estimated cost to go of states: a JAX function of displacements [m], axial position (from 1, 0 =
-unknown) and admissible bound. An ``equinox.Module``'s arrays are traced."""
+
+class States(NamedTuple):
+    """What a value function sees of partial plans."""
+
+    displacements: Float[Array, "N SJ"]  # [m]
+    remaining: Int[Array, "N SJ"]  # steps that each tendon has to go
+    stop: Int[Array, " N"]  # -1 = unknown
+    axial: Int[Array, " N"]  # axial position from 1, 0 = unknown
+    bound: Float[Array, " N"]  # admissible bound on the cost to go
+
+
+ValueFunction = Callable[[States], Float[Array, " N"]]
+"""Estimated cost to go: a JAX function. An ``equinox.Module``'s arrays are traced."""
 
 _SHORTLIST = 4  # times the width: plans, by promise, that a value function puts in order
 _HASHED = 4  # places in the table of states for every child
@@ -134,7 +142,9 @@ def search(
         done = ~jnp.any(kids.remaining > 0, axis=-1)
         promise = kids.cost + to_go
         alive = ~done & (promise < best)
-        promise = jnp.where(alive & _cheapest(kids, alive), promise, jnp.inf)
+        if rows > 1:  # the children of one plan all lead to other states
+            alive = _cheapest(kids, alive)
+        promise = jnp.where(alive, promise, jnp.inf)
         kept, exists = _first(kids, promise, to_go, lattice, value, width, rows)
         arrival = jnp.where(done, kids.cost, jnp.inf)
         arriving = jnp.argmin(arrival)
@@ -240,9 +250,9 @@ def _first(
         least, kept = _lowest(promise, min(rows, n))
     else:
         least, few = _lowest(promise, min(_SHORTLIST * rows, n))
-        chosen = kids._replace(remaining=kids.remaining[few], stop=kids.stop[few])
-        at = lattice.displacements(chosen.remaining)
-        order = kids.cost[few] + value(at, lattice.axial[chosen.stop], to_go[few])
+        remaining, stop = kids.remaining[few], kids.stop[few]
+        at = lattice.displacements(remaining)
+        order = kids.cost[few] + value(States(at, remaining, stop, lattice.axial[stop], to_go[few]))
         hopeful = jnp.isfinite(least) & (jnp.arange(len(few)) < _SHORTLIST * width)
         least, best = _lowest(jnp.where(hopeful, order, jnp.inf), min(rows, n))
         kept = few[best]

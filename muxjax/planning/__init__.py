@@ -12,6 +12,7 @@ from muxjax.planning.beamstep import beamstep, beamstep_printed
 from muxjax.planning.exact import exact
 from muxjax.planning.front import FrontPoint, front
 from muxjax.planning.lattice import Lattice
+from muxjax.planning.learned import learned
 from muxjax.planning.problem import (
     TERMS,
     Plan,
@@ -27,6 +28,7 @@ METHODS: Mapping[str, Callable[..., Plan]] = {
     "exact": exact,
     "beamstep": beamstep,
     "beamstep_printed": beamstep_printed,
+    "learned": learned,
     "sequential": sequential,
     "reverse": reverse,
     "greedy": greedy,
@@ -55,7 +57,8 @@ def plan(robot: Robot, problem: Problem, method: str = "exact", **options: Any) 
         robot: The arm.
         problem: Start, target, available servos and objective.
         method: "exact" (certified optimum), "beamstep" (layered), "beamstep_printed" (M Algorithm
-            1 to the letter), "sequential", "reverse" or "greedy" (M Eq. 13).
+            1 to the letter), "learned" (layered, in the order of a value network), "sequential",
+            "reverse" or "greedy" (M Eq. 13).
         **options: Options of the method, such as ``width`` of BeamStep.
 
     Returns:

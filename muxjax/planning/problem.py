@@ -8,7 +8,7 @@ in which steps they choose. The cost of a step is a weighted sum of named terms 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property, lru_cache
 from pathlib import Path
@@ -55,29 +55,34 @@ class PlanningError(RuntimeError):
 
 
 class PlannerConfig(Strict):
-    """A preset: the weights of the cost terms."""
+    """A preset: the weights of the cost terms, and the value network that "learned" takes."""
 
     file_schema: Literal["muxjax/planner/1"] = Field(alias="schema")
     name: str
     weights: dict[str, Sourced[Annotated[float, Field(ge=0)]]]
+    checkpoint: str | None = None  # by default the one with the robot's name
 
 
-def preset_weights(name_or_path: str) -> dict[str, float]:
-    """Weights of a shipped preset by name, or of a YAML file by path.
+def load_preset(name_or_path: str) -> PlannerConfig:
+    """A shipped preset by name, or a YAML file by path.
 
     Raises:
         ConfigError: No such preset, or a file with wrong values.
     """
     path = resolve(name_or_path, "planners")
-    return dict(_weights_of_file(path, path.stat().st_mtime_ns))
+    return _preset_of_file(path, path.stat().st_mtime_ns)
 
 
 @lru_cache
-def _weights_of_file(path: Path, changed: int) -> Mapping[str, float]:
+def _preset_of_file(path: Path, changed: int) -> PlannerConfig:
     """A file as it was when it was last changed; reading it takes longer than most plans."""
     del changed  # part of the key only
-    preset = load_yaml(PlannerConfig, path)
-    return {name: weight.value for name, weight in preset.weights.items()}
+    return load_yaml(PlannerConfig, path)
+
+
+def preset_weights(name_or_path: str) -> dict[str, float]:
+    """Weights of a preset."""
+    return {name: weight.value for name, weight in load_preset(name_or_path).weights.items()}
 
 
 @dataclass(frozen=True, eq=False)
@@ -189,6 +194,11 @@ class Problem:
             weights[COLLISION] = 1.0  # of a term that is zero or infinite
         return MappingProxyType(weights)
 
+    @property
+    def checkpoint(self) -> str | None:
+        """Value network that the preset names."""
+        return load_preset(self.preset).checkpoint if self.weights is None else None
+
     @cached_property
     def _known_terms(self) -> Mapping[str, Term]:
         of_world: dict[str, Term] = {}
@@ -210,15 +220,21 @@ class Problem:
         return np.array([self.cost_weights[name] for name, _ in self.weighted_terms])
 
     def compiled_terms(
-        self, *, expensive: bool
+        self, *, expensive: bool | None = None, without: Collection[str] = ()
     ) -> tuple[tuple[CostTerm, ...], Float[np.ndarray, " T"]]:
-        """Those terms that are, or are not, expensive, as compiled functions take them; weights."""
+        """Terms as compiled functions take them, and their weights.
+
+        Args:
+            expensive: Those that are, or are not, expensive; by default both.
+            without: Names of terms to leave out.
+        """
         chosen = [
-            (traced(self._known_terms[name]), self.cost_weights[name])
+            name
             for name in sorted(self.cost_weights)
-            if is_expensive(self._known_terms[name]) == expensive
+            if name not in without and expensive in (None, is_expensive(self._known_terms[name]))
         ]
-        return tuple(term for term, _ in chosen), np.array([weight for _, weight in chosen])
+        terms = tuple(traced(self._known_terms[name]) for name in chosen)
+        return terms, np.array([self.cost_weights[name] for name in chosen])
 
 
 class Plan(eqx.Module):

@@ -147,6 +147,15 @@ class Lattice:
         made = self._made[np.arange(len(self.steps)), self.steps - remaining]
         return self.problem.start + np.sign(self.problem.target - self.problem.start) * made
 
+    def remaining(self, displacements: Float[np.ndarray, "N SJ"]) -> Int[np.ndarray, "N SJ"]:
+        """States with these displacements [m], which must be of the lattice; see the one above."""
+        gone = np.abs(displacements - self.problem.start)
+        taken = [
+            np.argmin(np.abs(own[: n + 1] - way[:, None]), axis=1)
+            for own, n, way in zip(self._made, self.steps, gone.T, strict=True)
+        ]
+        return self.steps - np.stack(taken, axis=-1)
+
     def expand(
         self, remaining: Int[np.ndarray, "N SJ"]
     ) -> tuple[Bool[np.ndarray, "N G"], Int[np.ndarray, "N G SJ"]]:

@@ -19,6 +19,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
+from scipy.linalg import block_diag
 
 from muxjax.planning.arrays import BoundArrays, LatticeArrays, bound_arrays, lattice_arrays
 from muxjax.planning.lattice import Lattice
@@ -258,3 +259,18 @@ def _waiting_price(
     goal = bending_angles(robot, target)
     waits = step(robot, displacements, 0 * displacements, turns, 0 * turns, goal)
     return transition_cost(robot, terms, weights, waits)
+
+
+def turn_by_a_tendon(robot: Robot) -> Float[np.ndarray, "F F"]:
+    """Matrix that turns features about the arm's axis until each tendon stands where the next did.
+
+    Where tendons run straight and evenly, a problem turned so, with its servos, costs the same (C3
+    for J = 3). Obstacles, and gravity across the axis, break the symmetry.
+    """
+    s, j = robot.n_segments, robot.tendons_per_segment
+    angle = 2 * np.pi / j
+    rotate = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+    shift = np.roll(np.eye(j), 1, axis=0)
+    rest = n_features(robot) - 4 * s * j - 4 * s - j - len(ACTION_SETS) - 1
+    blocks = [*[shift] * (4 * s), *[rotate] * (2 * s), np.eye(rest), shift]
+    return np.asarray(block_diag(*blocks, np.eye(len(ACTION_SETS) + 1)))

@@ -1,0 +1,1 @@
+"""Training: labelled data, the value network, reinforcement learning, and their comparison."""

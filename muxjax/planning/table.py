@@ -143,11 +143,10 @@ class FullMoveTable:
         terms, weights = problem.compiled_terms(expensive=False)
         end = lattice.displacements(0 * lattice.steps)
         with jax.enable_x64(True):
-            priced = full_moves.edge_costs(
-                robot, terms, weights, problem.start, end, problem.target
-            )
-            self._edges = [[np.asarray(c) for c in costs] for costs in priced]
-        edges = tuple(full_moves.EdgeCosts(*(c[:, None] for c in costs)) for costs in self._edges)
+            ends = (x[:, None] for x in (problem.start, end, problem.target))
+            priced = full_moves.edge_costs(robot, terms, weights, *ends)
+            edges = tuple(full_moves.EdgeCosts(*map(np.asarray, costs)) for costs in priced)
+        self._edges = [[c[:, 0] for c in costs] for costs in edges]
         self.value = full_moves.values(robot, edges, healthy, self._whole, np)[..., 0]
         for stay, switch, _ in self._edges:
             if (np.minimum(stay, switch) < 0).any():

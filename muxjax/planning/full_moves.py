@@ -60,7 +60,7 @@ class Tables:
     place: Int[np.ndarray, " states"]  # of each state
     first: Int[np.ndarray, " levels"]  # place of the first state of each level
     levels: tuple[tuple[Level, ...], ...]  # [level - 1][layer]
-    legs_of: tuple[Level, ...]  # [layer], for every state, by number
+    legs_of: tuple[Level, ...]  # [layer], for every state, by place
 
 
 @lru_cache
@@ -73,10 +73,13 @@ def tables(n_segments: int, j: int) -> Tables:
     count = np.array([int(d).bit_count() for d in range(base)])[digits].sum(axis=-1)
     order = np.argsort(count, kind="stable")
     place = np.argsort(order, kind="stable")
-    legs_of = tuple(_legs(digits, layer, before, after, place) for layer in range(n_segments))
+    first = np.searchsorted(count[order], np.arange(n_segments * j + 2))
+    legs_of = tuple(
+        _legs(digits[order], layer, before, after, place) for layer in range(n_segments)
+    )
     levels = []
     for level in range(1, n_segments * j + 1):
-        rows = order[count[order] == level]
+        rows = slice(first[level], first[level + 1])
         widest = max(int(table.exists[rows].sum(axis=1).max()) for table in legs_of)
         levels.append(
             tuple(
@@ -84,7 +87,6 @@ def tables(n_segments: int, j: int) -> Tables:
                 for table in legs_of
             )
         )
-    first = np.searchsorted(count[order], np.arange(n_segments * j + 2))
     return Tables(n_segments, j, before, after, place, first, tuple(levels), legs_of)
 
 
@@ -271,12 +273,16 @@ def values(
     table = tables(robot.n_segments, robot.tendons_per_segment)
     axials, reach = reach_by_layer(robot, healthy, xp)
     back = np.argsort(np.concatenate(axials))
+    everywhere = [
+        allowed(*both, whole)[..., None] for both in zip(table.legs_of, reach, strict=True)
+    ]
     value = xp.zeros((1, len(robot.axial_map), edges[0].stay.shape[-1]))
-    for level in table.levels:
+    for number, level in enumerate(table.levels, start=1):
+        rows = slice(table.first[number], table.first[number + 1])
         stays, switches = [], []
         for layer, steps in enumerate(level):
-            after = value[steps.after][:, :, axials[layer]]
-            after = xp.where(allowed(steps, reach[layer], whole)[..., None], after, xp.inf)
+            may = everywhere[layer][rows, : steps.exists.shape[1]]
+            after = xp.where(may, value[:, axials[layer]][steps.after], xp.inf)
             stays.append(xp.min(edges[layer].stay[steps.edge][:, :, None] + after, axis=1))
             onwards = edges[layer].switch[steps.edge] + xp.min(after, axis=2)
             switches.append(xp.min(onwards, axis=1))
@@ -321,7 +327,7 @@ def costs_from_start(
             best = jnp.minimum(best, jnp.min(jnp.where(may, through, jnp.inf)))
         return best
 
-    return jax.vmap(one, in_axes=(-1, -1, 0))(value, edges, unfinished)
+    return jax.vmap(one, in_axes=(-1, -1, 0))(value, edges, jnp.asarray(table.place)[unfinished])
 
 
 def reach_by_layer(

@@ -64,6 +64,27 @@ def test_the_compiled_table_is_that_of_the_lattice(muxarm, rng, preset, action_s
                 assert [x[2] for x in ours] == pytest.approx([x[2] for x in theirs], rel=1e-8)
 
 
+def everything(robot, t):
+    """A term that looks at every field of a transition."""
+    angles = t.theta_before.sum(-1) + t.theta_after.max(-1) + t.theta_along.max(-2).sum(-1)
+    excess = t.excess_before + 2 * t.excess_mean + 3 * t.excess_peak + t.goal.sum(-1)
+    return angles + excess + t.wait + 5 * t.duration + (t.after**2 + t.before).sum(-1) ** 2
+
+
+def test_the_compiled_table_shows_terms_the_same_transitions(muxarm, rng):
+    start, target = 0.5 * random_targets(muxarm, rng, 2)
+    problem = Problem(start, target, weights={"all": 1.0}, terms={"all": everything}, servos=(2, 3))
+    lattice = Lattice(muxarm, problem)
+    first, second = (
+        np.sort(c.cost + c.to_go)
+        for c in (
+            table.choices(lattice.steps, -1, first=True)
+            for table in (FullMoveTable(lattice), LatticeTable(lattice, 2**30))
+        )
+    )
+    assert first == pytest.approx(second, abs=1e-10)
+
+
 def test_a_batch_is_its_plans(muxarm, rng):
     targets = random_targets(muxarm, rng, 19)
     for servos, axial in [((1, 3), None), ((1, 2, 3), 5)]:

@@ -104,9 +104,8 @@ def _costs(
     terms, weights = common.compiled_terms(expensive=False)
     healthy = np.isin(np.arange(1, robot.tendons_per_segment + 1), common.servos)
     with jax.enable_x64(True):
-        edges = full_moves.batch_edge_costs(
-            robot, terms, weights, starts, np.where(moves, targets, starts), targets
-        )
+        ends = np.where(moves, targets, starts)
+        edges = full_moves.edge_costs(robot, terms, weights, starts.T, ends.T, targets.T)
         cost = full_moves.costs_from_start(
             robot,
             edges,

@@ -20,7 +20,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from muxjax.planning.grid import layered_angles
-from muxjax.planning.motion import LEG_POINTS
+from muxjax.planning.motion import LEG_POINTS, leg_time, relative_excess
 from muxjax.planning.terms import CostTerm, Transition, transition_cost, waiting_time
 from muxjax.robot import Robot
 
@@ -60,7 +60,7 @@ class Tables:
     place: Int[np.ndarray, " states"]  # of each state
     first: Int[np.ndarray, " levels"]  # place of the first state of each level
     levels: tuple[tuple[Level, ...], ...]  # [level - 1][layer]
-    legs_of: tuple[Level, ...]  # [layer], for every state, by number
+    legs_of: tuple[Level, ...]  # [layer], for every state, by place
 
 
 @lru_cache
@@ -73,10 +73,13 @@ def tables(n_segments: int, j: int) -> Tables:
     count = np.array([int(d).bit_count() for d in range(base)])[digits].sum(axis=-1)
     order = np.argsort(count, kind="stable")
     place = np.argsort(order, kind="stable")
-    legs_of = tuple(_legs(digits, layer, before, after, place) for layer in range(n_segments))
+    first = np.searchsorted(count[order], np.arange(n_segments * j + 2))
+    legs_of = tuple(
+        _legs(digits[order], layer, before, after, place) for layer in range(n_segments)
+    )
     levels = []
     for level in range(1, n_segments * j + 1):
-        rows = order[count[order] == level]
+        rows = slice(first[level], first[level + 1])
         widest = max(int(table.exists[rows].sum(axis=1).max()) for table in legs_of)
         levels.append(
             tuple(
@@ -84,7 +87,6 @@ def tables(n_segments: int, j: int) -> Tables:
                 for table in legs_of
             )
         )
-    first = np.searchsorted(count[order], np.arange(n_segments * j + 2))
     return Tables(n_segments, j, before, after, place, first, tuple(levels), legs_of)
 
 
@@ -133,83 +135,123 @@ def edge_costs(
     robot: Robot,
     terms: tuple[CostTerm, ...],
     weights: Float[Array, " T"],
-    start: Float[Array, " SJ"],
-    end: Float[Array, " SJ"],
-    target: Float[Array, " SJ"],
-) -> tuple[tuple[jax.Array, ...], ...]:
-    """Costs of every leg of each layer, as in ``EdgeCosts`` but for the batch."""
+    start: Float[Array, "SJ batch"],
+    end: Float[Array, "SJ batch"],
+    target: Float[Array, "SJ batch"],
+) -> tuple[EdgeCosts, ...]:
+    """Costs of every leg of each layer."""
     table = tables(robot.n_segments, robot.tendons_per_segment)
-    bits = (np.arange(2**table.j)[:, None] >> np.arange(table.j)) & 1
-    starts, ends = (x.reshape(table.n_segments, 1, table.j) for x in (start, end))
+    bits = (np.arange(2**table.j)[:, None, None] >> np.arange(table.j)[:, None]) & 1
+    starts, ends, targets = (
+        x.reshape(table.n_segments, 1, table.j, -1) for x in (start, end, target)
+    )
     corners = list(jnp.where(bits == 1, starts, ends))
-    at_corners = _whole(layered_angles(robot, corners))
-    goal = jnp.stack([a.reshape(()) for a in layered_angles(robot, [*_rows(robot, target)])])
+    at_corners = layered_angles(robot, corners)
+    goal = jnp.stack([a.reshape(-1) for a in layered_angles(robot, [*targets])], axis=-1)
     costs = []
     for layer in range(table.n_segments):
-        begin, finish = (corners[layer][d] for d in (table.leg_before, table.leg_after))
-        fraction = ((np.arange(LEG_POINTS) + 0.5) / LEG_POINTS)[:, None, None]
-        along = (begin + fraction * (finish - begin)).reshape(-1, table.j)
-        points = [*corners[:layer], along, *corners[layer + 1 :]]
-        theta_along = _whole(layered_angles(robot, points))
-        shape = list(theta_along.shape)
-        shape[layer + 1 : layer + 2] = [LEG_POINTS, len(begin)]
-        # The short axes stand first in memory, where sums over them run over whole rows.
-        theta_along = jax.lax.optimization_barrier(theta_along.reshape(shape))
-        theta_along = jnp.moveaxis(theta_along, (layer + 1, 0), (-2, -1))
-        before, after = (
-            _whole_displacements([*corners[:layer], side, *corners[layer + 1 :]])
-            for side in (begin, finish)
-        )
-        theta_before, theta_after = (
-            jnp.moveaxis(jnp.take(at_corners, side, axis=layer + 1), 0, -1)
-            for side in (table.leg_before, table.leg_after)
-        )
+        leg = _legs_of_layer(robot, table, layer, corners, at_corners, goal)
+        defined = jnp.all(jnp.isfinite(leg.theta_after), axis=-1)
 
         def cost(
-            repositions: float,
-            engages: float,
-            before: Array = before,
-            after: Array = after,
-            theta: tuple[Array, Array, Array] = (theta_before, theta_after, theta_along),
+            repositions: float, engages: float, leg: Transition = leg, defined: Array = defined
         ) -> Array:
-            flags = jnp.full(before.shape[:-1], repositions)
+            flags = jnp.full_like(leg.repositions, repositions)
             wait = waiting_time(robot, flags, jnp.full_like(flags, engages))
-            moved = Transition(before, after, flags, wait, goal, *theta)
-            return transition_cost(robot, terms, weights, moved)
+            moved = leg._replace(repositions=flags, wait=wait)
+            value = transition_cost(robot, terms, weights, moved)
+            value = jnp.where(defined & jnp.isfinite(value), value, jnp.inf)
+            return value.reshape(-1, value.shape[-1])
 
-        defined = jnp.all(jnp.isfinite(theta_after), axis=-1)
-        variants = (cost(0.0, 0.0), cost(1.0, 0.0), cost(0.0, 1.0))
-        costs.append(
-            tuple(
-                jnp.where(defined & jnp.isfinite(value), value, jnp.inf).reshape(-1)
-                for value in variants
-            )
-        )
+        costs.append(EdgeCosts(cost(0.0, 0.0), cost(1.0, 0.0), cost(0.0, 1.0)))
     return tuple(costs)
 
 
-def _rows(robot: Robot, displacements: Array) -> Array:
-    return displacements.reshape(robot.n_segments, 1, robot.tendons_per_segment)
+def _legs_of_layer(
+    robot: Robot,
+    table: Tables,
+    layer: int,
+    corners: list[Array],
+    at_corners: list[Array],
+    goal: Float[Array, "batch S"],
+) -> Transition:
+    """Every leg of a layer, with the others at every corner, yet without any waiting.
 
+    The compiler drops what no term looks at.
+    """
+    begin, finish = (corners[layer][d] for d in (table.leg_before, table.leg_after))
+    before, after = (
+        _displacements([*corners[:layer], side, *corners[layer + 1 :]]) for side in (begin, finish)
+    )
+    theta_before, theta_after = (
+        [a if i < layer else jnp.take(a, side, axis=layer) for i, a in enumerate(at_corners)]
+        for side in (table.leg_before, table.leg_after)
+    )
+    zero = jnp.zeros(before.shape[:-1])
 
-def _whole(angles: list[jax.Array]) -> Array:
-    """Angles by segment on the whole grid, the segment first."""
-    shape = angles[-1].shape
-    return jnp.stack(
-        [
-            jnp.broadcast_to(a.reshape(*a.shape, *(1,) * (len(shape) - a.ndim)), shape)
-            for a in angles
-        ]
+    # A loop, so that what a point adds stays in a core's cache.
+    def point(found: tuple[Any, Any], fraction: Any) -> tuple[tuple[Any, Any], Any]:
+        along = begin + fraction * (finish - begin)
+        theta = layered_angles(robot, [*corners[:layer], along, *corners[layer + 1 :]])
+        excess = _excess(theta, goal)
+        return (found[0] + excess, jnp.maximum(found[1], excess)), _stacked(theta)
+
+    fractions = (np.arange(LEG_POINTS) + 0.5) / LEG_POINTS
+    (total, peak), theta_along = jax.lax.scan(point, (zero, zero), fractions)
+    duration = leg_time(robot, jnp.moveaxis(finish - begin, 1, -1))
+    return Transition(
+        before=before,
+        after=after,
+        repositions=zero,
+        wait=zero,
+        duration=_spread(duration, layer, zero.shape),
+        goal=goal,
+        theta_before=_stacked(theta_before),
+        theta_after=_stacked(theta_after),
+        theta_along=jnp.moveaxis(theta_along, 0, -2),
+        excess_before=_excess(theta_before, goal),
+        excess_mean=total / LEG_POINTS,
+        excess_peak=peak,
     )
 
 
-def _whole_displacements(points: list[Array]) -> Array:
-    shape = tuple(len(p) for p in points)
-    columns = []
-    for layer, p in enumerate(points):
-        p = p.reshape(*(len(p) if k == layer else 1 for k in range(len(shape))), p.shape[-1])
-        columns.append(jnp.broadcast_to(p, (*shape, p.shape[-1])))
-    return jnp.concatenate(columns, axis=-1)
+def _excess(angles: list[Array], goal: Float[Array, "batch S"]) -> Array:
+    """Relative excess, each segment's on the grid up to its layer before they are added up."""
+    each = (relative_excess(a[..., None], goal[:, i : i + 1]) for i, a in enumerate(angles))
+    return sum(_whole([*each]), start=jnp.zeros(()))
+
+
+def _stacked(angles: list[Array]) -> Array:
+    return jnp.stack(_whole(angles), axis=-1)
+
+
+def _whole(values: list[Array]) -> list[Array]:
+    """Values of each segment, on the grid up to its layer, spread over the whole grid."""
+    *grid, batch = values[-1].shape
+    return [
+        jnp.broadcast_to(
+            a.reshape(*a.shape[:-1], *(1,) * (len(grid) + 1 - a.ndim), batch), (*grid, batch)
+        )
+        for a in values
+    ]
+
+
+def _spread(values: Float[Array, "_ batch"], layer: int, shape: tuple[int, ...]) -> Array:
+    """Values at the points of one layer, spread over the whole grid."""
+    *grid, batch = shape
+    at = values.reshape(*(n if k == layer else 1 for k, n in enumerate(grid)), batch)
+    return jnp.broadcast_to(at, shape)
+
+
+def _displacements(points: list[Array]) -> Array:
+    """Of all tendons on the whole grid."""
+    shape = (*(len(p) for p in points), points[0].shape[-1])
+    columns = [
+        _spread(column, layer, shape)
+        for layer, p in enumerate(points)
+        for column in jnp.moveaxis(p, 1, 0)
+    ]
+    return jnp.stack(columns, axis=-1)
 
 
 def values(
@@ -231,12 +273,16 @@ def values(
     table = tables(robot.n_segments, robot.tendons_per_segment)
     axials, reach = reach_by_layer(robot, healthy, xp)
     back = np.argsort(np.concatenate(axials))
+    everywhere = [
+        allowed(*both, whole)[..., None] for both in zip(table.legs_of, reach, strict=True)
+    ]
     value = xp.zeros((1, len(robot.axial_map), edges[0].stay.shape[-1]))
-    for level in table.levels:
+    for number, level in enumerate(table.levels, start=1):
+        rows = slice(table.first[number], table.first[number + 1])
         stays, switches = [], []
         for layer, steps in enumerate(level):
-            after = value[steps.after][:, :, axials[layer]]
-            after = xp.where(allowed(steps, reach[layer], whole)[..., None], after, xp.inf)
+            may = everywhere[layer][rows, : steps.exists.shape[1]]
+            after = xp.where(may, value[:, axials[layer]][steps.after], xp.inf)
             stays.append(xp.min(edges[layer].stay[steps.edge][:, :, None] + after, axis=1))
             onwards = edges[layer].switch[steps.edge] + xp.min(after, axis=2)
             switches.append(xp.min(onwards, axis=1))
@@ -281,21 +327,7 @@ def costs_from_start(
             best = jnp.minimum(best, jnp.min(jnp.where(may, through, jnp.inf)))
         return best
 
-    return jax.vmap(one, in_axes=(-1, -1, 0))(value, edges, unfinished)
-
-
-@jax.jit
-def batch_edge_costs(
-    robot: Robot,
-    terms: tuple[CostTerm, ...],
-    weights: Float[Array, " T"],
-    starts: Float[Array, "batch SJ"],
-    ends: Float[Array, "batch SJ"],
-    targets: Float[Array, "batch SJ"],
-) -> tuple[EdgeCosts, ...]:
-    """``edge_costs`` of many problems."""
-    price = jax.vmap(edge_costs, in_axes=(None, None, None, 0, 0, 0), out_axes=-1)
-    return tuple(EdgeCosts(*c) for c in price(robot, terms, weights, starts, ends, targets))
+    return jax.vmap(one, in_axes=(-1, -1, 0))(value, edges, jnp.asarray(table.place)[unfinished])
 
 
 def reach_by_layer(

@@ -30,8 +30,10 @@ class Rest(NamedTuple):
     my: Any
 
 
-def layered_angles(robot: Robot, points: Sequence[Float[Array, "_ J"]], xp: Any = jnp) -> list[Any]:
-    """Bending angle [rad] of each segment: entry i has shape (P_1, ..., P_i).
+def layered_angles(
+    robot: Robot, points: Sequence[Float[Array, "_ J *batch"]], xp: Any = jnp
+) -> list[Any]:
+    """Bending angle [rad] of each segment: entry i has shape (P_1, ..., P_i, *batch).
 
     Equal to ``motion.bending_angles`` at every combination of points; NaN where that is.
 
@@ -42,50 +44,47 @@ def layered_angles(robot: Robot, points: Sequence[Float[Array, "_ J"]], xp: Any 
     """
     angles = []
     for i, rest in layered_rests(robot, points, xp):
-        bx, by = _bending(robot, i, rest, xp)
-        angle = xp.sqrt(bx * bx + by * by)
-        # Without the barrier XLA would compute an angle anew for every use of it.
-        angles.append(angle if xp is np else jax.lax.optimization_barrier(angle))
+        harmonic = xp.sqrt(rest.mx * rest.mx + rest.my * rest.my)
+        angles.append(harmonic * _per_harmonic(robot, i, rest, xp))
     return angles
 
 
 def layered_rests(
-    robot: Robot, points: Sequence[Float[Array, "_ J"]], xp: Any = jnp
+    robot: Robot, points: Sequence[Float[Array, "_ J *batch"]], xp: Any = jnp
 ) -> list[tuple[int, Rest]]:
-    """Each segment's number and its ``Rest``, as in ``layered_angles``."""
+    """Each segment's number and its ``Rest``, as in ``layered_angles``.
+
+    What later layers use again comes out of matrix products: XLA computes these once, where it
+    would compute sums anew at every point of the grid.
+    """
     psi, radius = xp.asarray(robot.tendon_azimuth), robot.tendon_radius
-    shares: list[tuple[Any, Any, Any]] = []  # chord ratio s - 1, and s times b, by segment
+    shares: list[Any] = []  # chord ratio s - 1, and s times b, by segment
     rests = []
-    for i, own in enumerate(points):
-        functionals = _mean_and_harmonic(psi[i, i], xp)
-        arc, mx, my = (own @ f for f in functionals)
+    for i, layer in enumerate(points):
+        functionals = xp.stack(_mean_and_harmonic(psi[i, i], xp))
+        arc, mx, my = xp.tensordot(functionals, layer, axes=(1, 1))
         arc = arc + robot.length[i]
         for n, share in enumerate(shares):
-            longer, sx, sy = (x.reshape(*x.shape, *(1,) * (i - n)) for x in share)
-            constant, cosine, sine = (
-                [xp.sum(f * w) for f in functionals]
-                for w in (1.0, xp.cos(psi[n, i]), xp.sin(psi[n, i]))
-            )
-            through = [
-                robot.length[n] * longer * constant[k] - radius * (sx * cosine[k] + sy * sine[k])
-                for k in range(3)
-            ]
+            waves = [robot.length[n] * xp.ones_like(psi[n, i])]
+            waves += [-radius * xp.cos(psi[n, i]), -radius * xp.sin(psi[n, i])]
+            through = xp.tensordot(functionals @ xp.stack(waves, axis=1), share, axes=1)
+            through = through.reshape(*through.shape[: n + 2], *(1,) * (i - n), *layer.shape[2:])
             arc, mx, my = arc - through[0], mx - through[1], my - through[2]
-        rests.append((i, Rest(arc, mx, my)))
-        bx, by = _bending(robot, i, rests[-1][1], xp)
-        u = (bx * bx + by * by) / (4 * robot.n_discs[i] ** 2)
-        ratio = xp.sinc(xp.sqrt(u) / xp.pi) if xp is np else stumpff(u, 1)
-        share = (ratio - 1.0, ratio * bx, ratio * by)
-        # Without the barrier XLA would compute a share anew for every point of the later layers.
-        shares.append(share if xp is np else jax.lax.optimization_barrier(share))
+        rest = Rest(arc, mx, my)
+        rests.append((i, rest))
+        if i + 1 < len(points):
+            scale = _per_harmonic(robot, i, rest, xp)
+            bx, by = -mx * scale, -my * scale
+            u = (bx * bx + by * by) / (4 * robot.n_discs[i] ** 2)
+            ratio = xp.sinc(xp.sqrt(u) / xp.pi) if xp is np else stumpff(u, 1)
+            shares.append(xp.stack([ratio - 1.0, ratio * bx, ratio * by]))
     return rests
 
 
-def _bending(robot: Robot, segment: int, rest: Rest, xp: Any) -> tuple[Any, Any]:
-    """Bending vector [rad] of a segment (M Eq. 4-5)."""
+def _per_harmonic(robot: Robot, segment: int, rest: Rest, xp: Any) -> Any:
+    """Bending of a segment by its first harmonic [rad/m] (M Eq. 4-5)."""
     arc = xp.where(rest.arc > 0, rest.arc, xp.nan)
-    scale = robot.length[segment] / (robot.tendon_radius * arc)
-    return -rest.mx * scale, -rest.my * scale
+    return robot.length[segment] / (robot.tendon_radius * arc)
 
 
 def _mean_and_harmonic(azimuth: Float[Array, " J"], xp: Any) -> list[Any]:

@@ -174,7 +174,7 @@ class Lattice:
         remaining: Int[np.ndarray, "N SJ"],
         moves: Int[np.ndarray, "N SJ"],
         *,
-        first: bool = False,
+        first: bool | Bool[np.ndarray, " N"] = False,
         expensive: bool = False,
     ) -> Float[np.ndarray, "N 2"]:
         """Cost of moving tendons by some steps, without and with a repositioning before it.
@@ -185,7 +185,7 @@ class Lattice:
         Args:
             remaining: States before the step.
             moves: Steps that each tendon moves.
-            first: These are first steps: without repositioning, clutches still engage.
+            first: Which are first steps: without repositioning, clutches still engage.
             expensive: The cost by the expensive terms instead of that by the others.
 
         Raises:
@@ -195,6 +195,8 @@ class Lattice:
         if expensive and not terms:
             return np.zeros((len(remaining), 2))
         before, after = self.displacements(remaining), self.displacements(remaining - moves)
+        firsts = np.zeros((len(before), 1))
+        firsts[:, 0] = first
         size = _EXPENSIVE_BATCH if expensive else _LARGEST_BATCH
         parts: list[np.ndarray] = [np.zeros((0, 2))]
         for i in range(0, len(before), size):
@@ -207,7 +209,7 @@ class Lattice:
                     _padded(before[batch], expensive),
                     _padded((after - before)[batch], expensive),
                     self.problem.target,
-                    np.float64(first),
+                    _padded(firsts[batch], expensive),
                     one_code=expensive,
                 )
                 parts.append(np.asarray(batch_costs)[: len(before[batch])])
@@ -243,7 +245,7 @@ def _batch_costs(
     before: Float[Array, "N SJ"],
     move: Float[Array, "N SJ"],
     target: Float[Array, " SJ"],
-    first: Float[Array, ""],
+    first: Float[Array, "N 1"],
     *,
     one_code: bool,
 ) -> Float[Array, "N 2"]:
@@ -252,7 +254,7 @@ def _batch_costs(
 
     def cost(repositions: Float[Array, ""] | float) -> jax.Array:
         flags = jnp.full(before.shape[0], repositions)
-        engages = (1.0 - flags) * first
+        engages = (1.0 - flags) * first[:, 0]
         moved = step(robot, before, move, flags, engages, goal)
         return jnp.asarray(transition_cost(robot, terms, weights, moved))
 

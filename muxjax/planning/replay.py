@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -11,6 +12,9 @@ from muxjax.planning.axial import fewest_repositionings
 from muxjax.planning.bounds import bound_of
 from muxjax.planning.lattice import Lattice
 from muxjax.planning.problem import Plan
+from muxjax.planning.table import FullMoveTable
+
+_ROUNDING = 1e-12  # relative, between the sums of two plans of equal cost
 
 
 @dataclass(frozen=True)
@@ -40,7 +44,7 @@ def replay(
         lattice: The problem on the robot.
         steps: From the start to the target.
         method: Name of the planner.
-        lower_bound: What the planner has proved; by default the admissible bound at the start.
+        lower_bound: What the planner has proved; by default the bound at the start.
         expansions: States whose steps were evaluated.
         optimal: The planner has proved that nothing is cheaper.
     """
@@ -52,11 +56,13 @@ def replay(
     if remaining[-1].any() or off > lattice.problem.tolerance * (1 + 1e-9):
         raise AssertionError(f"{method}: the plan ends {off:g} m from the target")
     own = lattice.axial_of(np.array([s.stop for s in steps], dtype=np.int64))
-    both = _costs(lattice, remaining[:-1], moved, expensive=False)
-    with_obstacles = both + _costs(lattice, remaining[:-1], moved, expensive=True)
+    first = np.arange(len(moved)) == 0
+    both, obstacles = (
+        lattice.costs(remaining[:-1], moved, first=first, expensive=e) for e in (False, True)
+    )
     cost, axial = min(
         (
-            (_cost(lattice, with_obstacles, axial), axial)
+            (_cost(lattice, both + obstacles, axial), axial)
             for axial in (own, _fewest(lattice, moved > 0, own))
         ),
         key=lambda priced: priced[0],
@@ -66,7 +72,7 @@ def replay(
     if optimal:
         lower_bound = cost
     elif lower_bound is None:
-        lower_bound = float(bound_of(lattice)(*_start(lattice))[0])
+        lower_bound = _bound_at_start(lattice)
     return Plan(
         displacements=displacements,
         axial=axial,
@@ -79,19 +85,6 @@ def replay(
         status="optimal" if optimal else "feasible",
         action_set=lattice.problem.action_set,
     )
-
-
-def _costs(
-    lattice: Lattice,
-    remaining: Int[np.ndarray, "K SJ"],
-    moved: Int[np.ndarray, "K SJ"],
-    *,
-    expensive: bool,
-) -> Float[np.ndarray, "K 2"]:
-    """Cost of every step, without and with a repositioning before it."""
-    both = lattice.costs(remaining, moved, expensive=expensive)
-    both[:1] = lattice.costs(remaining[:1], moved[:1], first=True, expensive=expensive)
-    return both
 
 
 def _why(lattice: Lattice, both: Float[np.ndarray, "K 2"]) -> str:
@@ -119,7 +112,7 @@ def failed(lattice: Lattice, *, method: str, reason: str, expansions: int) -> Pl
         displacements=lattice.problem.start[None],
         axial=np.zeros(0, dtype=np.int64),
         cost=float("inf"),
-        lower_bound=float(bound_of(lattice)(*_start(lattice))[0]),
+        lower_bound=_bound_at_start(lattice),
         expansions=expansions,
         problem=lattice.problem,
         fingerprint=lattice.robot.fingerprint,
@@ -130,5 +123,13 @@ def failed(lattice: Lattice, *, method: str, reason: str, expansions: int) -> Pl
     )
 
 
-def _start(lattice: Lattice) -> tuple[Int[np.ndarray, "1 SJ"], Int[np.ndarray, " 1"]]:
-    return lattice.steps[None], np.array([lattice.start_stop])
+@lru_cache(maxsize=1)
+def _bound_at_start(lattice: Lattice) -> float:
+    """What no plan can beat: of full moves their optimum, which takes less than patterns do."""
+    if FullMoveTable.fits(lattice) and lattice.steps.any():
+        choices = FullMoveTable(lattice).choices(lattice.steps, lattice.start_stop, first=True)
+        optimum = float(np.min(choices.cost + choices.to_go))
+        if np.isfinite(optimum):
+            return optimum * (1 - _ROUNDING)
+    start = lattice.steps[None], np.array([lattice.start_stop])
+    return float(bound_of(lattice)(*start)[0])

@@ -127,11 +127,7 @@ class LatticeTable:
 
 
 class FullMoveTable:
-    """Full moves of one problem.
-
-    Raises:
-        PlanningError: A cost term is negative, or lower with a repositioning than without.
-    """
+    """Full moves of one problem."""
 
     def __init__(self, lattice: Lattice) -> None:
         robot, problem = lattice.robot, lattice.problem
@@ -143,12 +139,27 @@ class FullMoveTable:
         terms, weights = problem.compiled_terms(expensive=False)
         end = lattice.displacements(0 * lattice.steps)
         with jax.enable_x64(True):
-            priced = full_moves.edge_costs(
-                robot, terms, weights, problem.start, end, problem.target
-            )
-            self._edges = [[np.asarray(c) for c in costs] for costs in priced]
-        edges = tuple(full_moves.EdgeCosts(*(c[:, None] for c in costs)) for costs in self._edges)
+            ends = (x[:, None] for x in (problem.start, end, problem.target))
+            priced = full_moves.edge_costs(robot, terms, weights, *ends)
+            edges = tuple(full_moves.EdgeCosts(*map(np.asarray, costs)) for costs in priced)
+        self._edges = [[c[:, 0] for c in costs] for costs in edges]
         self.value = full_moves.values(robot, edges, healthy, self._whole, np)[..., 0]
+        self._representative = [
+            int(np.argmax(lattice.stop_of_axial == stop)) for stop in range(len(lattice.reach))
+        ]
+        self.expansions = len(self.value) - 1
+
+    @staticmethod
+    def fits(lattice: Lattice) -> bool:
+        """Whether every move of a lattice goes all the way, and the states are few."""
+        return bool(lattice.steps.max() <= 1) and full_moves.fits(lattice.robot)
+
+    def check(self) -> None:
+        """Refuse costs that have no optimum.
+
+        Raises:
+            PlanningError: A cost term is negative, or lower with a repositioning than without.
+        """
         for stay, switch, _ in self._edges:
             if (np.minimum(stay, switch) < 0).any():
                 raise PlanningError("a cost term is negative; terms must be at least 0")
@@ -156,20 +167,16 @@ class FullMoveTable:
                 raise PlanningError(
                     "exact: a cost term pays for repositioning, which has no optimum"
                 )
-        self._representative = [
-            int(np.argmax(lattice.stop_of_axial == stop)) for stop in range(len(lattice.reach))
-        ]
-        self.expansions = len(self.value) - 1
 
     def choices(
         self, remaining: Int[np.ndarray, " SJ"], stop: int, *, first: bool = False
     ) -> Choices:
         """Steps from a state at a stop (-1: not known); ``first`` if it is the start."""
         j = self._tables.j
-        number = int(full_moves.number(remaining > 0, j))
+        place = self._tables.place[full_moves.number(remaining > 0, j)]
         rows = []
         for layer, everywhere in enumerate(self._tables.legs_of):
-            steps = full_moves.Level(*(a[number][None] for a in everywhere))
+            steps = full_moves.Level(*(a[place][None] for a in everywhere))
             may = full_moves.allowed(steps, self._reach[layer], self._whole)[0]
             stay, switch, engage = self._edges[layer]
             for slot, a in np.argwhere(may):
@@ -195,6 +202,8 @@ def solved_table(lattice: Lattice, memory_limit: int) -> Table:
     Raises:
         PlanningError: See the tables.
     """
-    if lattice.steps.max() <= 1 and full_moves.fits(lattice.robot):
-        return FullMoveTable(lattice)
+    if FullMoveTable.fits(lattice):
+        table = FullMoveTable(lattice)
+        table.check()
+        return table
     return LatticeTable(lattice, memory_limit)

@@ -22,7 +22,6 @@ import numpy as np
 from jaxtyping import Float
 
 from muxjax.kinematics import stumpff
-from muxjax.planning.motion import leg_time
 from muxjax.planning.terms import Transition
 from muxjax.robot import Robot
 from muxjax.statics.recursion import solve_pivotless
@@ -66,7 +65,7 @@ class Tension(eqx.Module):
         points = jnp.stack([t.before, 0.5 * (t.before + t.after), t.after])
         before, halfway, after = self.largest(robot, points)
         along = (before + 4 * halfway + after) / 6  # Simpson's rule
-        return t.wait * before + leg_time(robot, t.after - t.before) * along
+        return t.wait * before + t.duration * along
 
     def largest(self, robot: Robot, displacements: Float[Array, "*n SJ"]) -> Float[Array, "*n"]:
         """Tension of the tendon that is pulled hardest [N]."""

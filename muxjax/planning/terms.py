@@ -32,23 +32,32 @@ class Transition(NamedTuple):
     repositions: Float[Array, "*n"]  # 1 where the axial motor moves first, else 0
     wait: Float[Array, "*n"]  # time spent at `before` until the tendons move [s]: t_sw, or the
     # engagement alone for a first step at the axial position where the drum stands, or 0
+    duration: Float[Array, "*n"]  # of the leg, until the last tendon arrives [s]
     goal: Float[Array, "*#n S"]  # bending angles of the target [rad]
     theta_before: Float[Array, "*n S"]  # bending angles [rad]
     theta_after: Float[Array, "*n S"]
     theta_along: Float[Array, "*n points S"]  # at the midpoints of 8 equal parts of the leg
+    excess_before: Float[Array, "*n"]  # relative overshoot of all segments together
+    excess_mean: Float[Array, "*n"]  # of it at those points
+    excess_peak: Float[Array, "*n"]
 
 
 Term = Callable[[Robot, Transition], Float[Array, "*n"]]
 
 
 def travel(robot: Robot, t: Transition) -> Float[Array, "*n"]:
-    """Sum of |dl| [m] (M Eq. 8)."""
-    return jnp.sum(jnp.abs(t.after - t.before), axis=-1)
+    """Sum of |dl| [m] (M Eq. 8).
+
+    Column by column here and in ``bending``: compiled tables then need no array of all tendons.
+    """
+    each = (jnp.abs(t.after[..., c] - t.before[..., c]) for c in range(robot.n_tendons))
+    return sum(each, start=jnp.zeros_like(t.wait))
 
 
 def bending(robot: Robot, t: Transition) -> Float[Array, "*n"]:
     """|theta(l^k)|^2 [rad^2] at the end of the step (M Eq. 8)."""
-    return jnp.sum(t.theta_after**2, axis=-1)
+    each = (t.theta_after[..., i] ** 2 for i in range(robot.n_segments))
+    return sum(each, start=jnp.zeros_like(t.wait))
 
 
 def switches(robot: Robot, t: Transition) -> Float[Array, "*n"]:
@@ -58,14 +67,12 @@ def switches(robot: Robot, t: Transition) -> Float[Array, "*n"]:
 
 def time(robot: Robot, t: Transition) -> Float[Array, "*n"]:
     """Execution time [s] (M Eq. 14)."""
-    return t.wait + leg_time(robot, t.after - t.before)
+    return t.wait + t.duration
 
 
 def overshoot(robot: Robot, t: Transition) -> Float[Array, "*n"]:
     """Relative overshoot integrated over waiting and motion [s] (M Eq. 15, made additive)."""
-    along = jnp.mean(relative_excess(t.theta_along, t.goal[..., None, :]), axis=-1)
-    waiting = t.wait * relative_excess(t.theta_before, t.goal)
-    return waiting + leg_time(robot, t.after - t.before) * along
+    return t.wait * t.excess_before + t.duration * t.excess_mean
 
 
 def overshoot_peak(robot: Robot, t: Transition) -> Float[Array, "*n"]:
@@ -75,8 +82,7 @@ def overshoot_peak(robot: Robot, t: Transition) -> Float[Array, "*n"]:
     at the points looked at (8 on a leg, and its end) it is never below the maximum, and both are
     zero together.
     """
-    along = jnp.max(relative_excess(t.theta_along, t.goal[..., None, :]), axis=-1)
-    return jnp.maximum(along, relative_excess(t.theta_after, t.goal))
+    return jnp.maximum(t.excess_peak, relative_excess(t.theta_after, t.goal))
 
 
 TERMS: Mapping[str, Term] = {
@@ -152,16 +158,23 @@ def step(
     """
     after = displacements + move
     theta_before = bending_angles(robot, displacements)
+    theta_before = jnp.broadcast_to(theta_before, (*after.shape[:-1], theta_before.shape[-1]))
     before = jnp.broadcast_to(displacements, after.shape)
+    theta_along = angles_along(robot, before, after)
+    excess_along = relative_excess(theta_along, goal[..., None, :])
     return Transition(
         before=before,
         after=after,
         repositions=repositions,
         wait=waiting_time(robot, repositions, engages),
+        duration=leg_time(robot, move),
         goal=goal,
-        theta_before=jnp.broadcast_to(theta_before, (*after.shape[:-1], theta_before.shape[-1])),
+        theta_before=theta_before,
         theta_after=bending_angles(robot, after),
-        theta_along=angles_along(robot, before, after),
+        theta_along=theta_along,
+        excess_before=relative_excess(theta_before, goal),
+        excess_mean=jnp.mean(excess_along, axis=-1),
+        excess_peak=jnp.max(excess_along, axis=-1),
     )
 
 

@@ -16,7 +16,7 @@ from jaxtyping import Float
 
 from muxjax.collision import World, clearance
 from muxjax.kinematics import configuration_from_bending
-from muxjax.planning.motion import LEG_POINTS, leg_points, leg_time
+from muxjax.planning.motion import LEG_POINTS, leg_points
 from muxjax.planning.terms import Transition
 from muxjax.robot import Robot
 from muxjax.tendons import bending_from_displacements
@@ -125,7 +125,7 @@ class Clearance(eqx.Module):
         points = leg_points(t.before, t.after)
         along = jnp.mean(self._inside(robot, points), axis=-1)
         waiting = t.wait * self._inside(robot, t.before)
-        return waiting + leg_time(robot, t.after - t.before) * along
+        return waiting + t.duration * along
 
     def _inside(self, robot: Robot, displacements: Float[Array, "*n SJ"]) -> Float[Array, "*n"]:
         distance = clearance_at(robot, displacements, self.world)

@@ -1,11 +1,9 @@
 """Labelled decisions: states, some of their actions, and what each of these costs to the end.
 
-    python -m training.dataset --config configs/training/value.yaml --out out/value
-
 A decision is a state and K of its actions. Of every action the data hold the features of the state
-after it, the admissible count there, the cost of the step and the cost to go, all over the problem's
-scale. Shards are made in parallel, each from its own seed; one that lies there already is kept, so
-an interrupted run goes on. The manifest tells how they were made, with their hashes.
+after it, the admissible count there, the cost of the step and the cost to go, costs over the
+problem's scale. Shards are made in parallel, each from its own seed; one that lies there already is
+kept, so an interrupted run goes on. The manifest tells how they were made, with their hashes.
 """
 
 from __future__ import annotations
@@ -285,10 +283,9 @@ def make_shards(
         for future in as_completed([pool.submit(_make, task) for task in open_tasks]):
             name, decisions = future.result()
             done += 1
-            say(
-                f"{done}/{len(tasks)} {name}: {decisions} decisions, {time.monotonic() - began:.0f} s"
-            )
-    shards = {t.path.name: hashlib.sha256(t.path.read_bytes()).hexdigest()[:16] for t in tasks}
+            seconds = time.monotonic() - began
+            say(f"{done}/{len(tasks)} {name}: {decisions} decisions, {seconds:.0f} s")
+    shards = {task.path.name: _digest(task.path) for task in tasks}
     manifest.write_text(
         json.dumps({**json.loads(manifest.read_text()), "shards": shards}, indent=1)
     )
@@ -299,6 +296,8 @@ def _sizes(problems: int) -> list[int]:
 
 
 def _make(task: _Task) -> tuple[str, int]:
+    # Every process would compile the same searches anew, for minutes.
+    jax.config.update("jax_compilation_cache_dir", str(task.path.parent / "compiled"))
     robot = muxjax.load_robot(task.robot)
     parts = []
     for number in range(task.problems):
@@ -314,25 +313,38 @@ def _make(task: _Task) -> tuple[str, int]:
     return task.path.name, len(whole.count)
 
 
-def load_decisions(folder: Path) -> Decisions:
-    """All shards of a folder.
+def load_decisions(folder: Path, names: list[str] | None = None) -> Decisions:
+    """Shards of a folder, all by default.
 
     Raises:
         ValueError: No manifest, or a shard is missing or altered.
     """
-    manifest = folder / "manifest.json"
-    if not manifest.is_file():
-        raise ValueError(f"{folder}: no manifest.json; make the data with training.dataset")
+    digests = shards_of(folder)
     parts = []
-    for name, digest in json.loads(manifest.read_text())["shards"].items():
+    for name in sorted(digests) if names is None else names:
         path = folder / name
-        if not path.is_file() or hashlib.sha256(path.read_bytes()).hexdigest()[:16] != digest:
-            raise ValueError(
-                f"{path}: missing or altered; delete it and run training.dataset again"
-            )
+        if not path.is_file() or _digest(path) != digests[name]:
+            raise ValueError(f"{path}: missing or altered; delete it and make the data again")
         with np.load(path) as arrays:
             parts.append(Decisions(**arrays))
     return Decisions(*(np.concatenate(column) for column in zip(*parts, strict=True)))
+
+
+def shards_of(folder: Path) -> dict[str, str]:
+    """Digests of a folder's shards by name.
+
+    Raises:
+        ValueError: No manifest, or one of data that are not complete.
+    """
+    manifest = folder / "manifest.json"
+    shards = json.loads(manifest.read_text())["shards"] if manifest.is_file() else {}
+    if not shards:
+        raise ValueError(f"{folder}: holds no complete data")
+    return dict(shards)
+
+
+def _digest(path: Path) -> str:
+    return hashlib.sha256(path.read_bytes()).hexdigest()[:16]
 
 
 def digest_of(net: ValueNet) -> str:

@@ -33,7 +33,7 @@ from muxjax.planning.checkpoint import save_value
 from muxjax.planning.value import ValueNet, n_features, turn_by_a_tendon, value_net
 from muxjax.robot import Robot
 from training.config import TrainingConfig
-from training.dataset import Decisions, commit, load_decisions, make_shards
+from training.dataset import Decisions, commit, load_decisions, make_shards, shards_of
 
 _HUBER = 0.05  # error [scale] beyond which the value's loss is linear
 
@@ -121,6 +121,7 @@ def fit(config: TrainingConfig, out: Path, data: Path | None = None) -> ValueNet
     }
     save_value(out / "best.value", progress.best, robot, about)
     print(f"{out / 'best.value'}: {about['curve']}")
+    trainer.writer.close()
     return progress.best
 
 
@@ -138,8 +139,9 @@ class _Trainer:
 
     def __init__(self, config: TrainingConfig, robot: Robot, out: Path) -> None:
         self.config, self.out = config, out
-        self.turn = jnp.asarray(turn_by_a_tendon(robot), jnp.float32)
-        self.turns = robot.tendons_per_segment if config.symmetry else 1
+        turn = turn_by_a_tendon(robot)
+        count = robot.tendons_per_segment if config.symmetry else 1
+        self.turns = [np.linalg.matrix_power(turn, k).astype(np.float32) for k in range(count)]
         self.sizes = (n_features(robot), *config.hidden, 1)
         self.writer = SummaryWriter(str(out / "tensorboard"))
         self.curve: list[dict[str, float]] = []
@@ -196,8 +198,8 @@ class _Trainer:
         net, state, total = progress.net, progress.optimiser, 0.0
         for rows in np.array_split(order, batches):
             chosen = _sharded(Decisions(*(x[rows[: len(order) // batches]] for x in train)))
-            turns = rng.integers(self.turns, size=len(chosen.count))
-            net, state, loss = _step(self._hyper, optimiser, net, state, chosen, turns, self.turn)
+            turn = self.turns[rng.integers(len(self.turns))]
+            net, state, loss = _step(self._hyper, optimiser, net, state, chosen, turn)
             total += float(loss)
         scores = {k: float(v) for k, v in self._scores(net, held).items()}
         improved = scores["loss"] < float(progress.lowest)
@@ -231,7 +233,9 @@ class _Trainer:
 
     def _scores(self, net: ValueNet, held: Decisions) -> dict[str, Any]:
         chunks = range(0, len(held.count), 4096)
-        parts = [_judged(self._hyper, net, Decisions(*(x[i : i + 4096] for x in held))) for i in chunks]
+        parts = [
+            _judged(self._hyper, net, Decisions(*(x[i : i + 4096] for x in held))) for i in chunks
+        ]
         weights = np.array([min(4096, len(held.count) - i) for i in chunks])
         return {
             name: np.average([float(part[name]) for part in parts], weights=weights)
@@ -240,8 +244,8 @@ class _Trainer:
 
 
 def _split(folder: Path) -> tuple[Decisions, Decisions]:
-    """Training decisions, and those of the last shard of each regime, which are of other targets."""
-    names = sorted(json.loads((folder / "manifest.json").read_text())["shards"])
+    """Training decisions, and those of each regime's last shard, which are of other targets."""
+    names = sorted(shards_of(folder))
     last = {name.rsplit("_", 1)[0]: name for name in names}
     held = set(last.values())
     if len(held) == len(names):
@@ -302,11 +306,11 @@ def _step(
     net: ValueNet,
     state: Any,
     decisions: Decisions,
-    matrices: Any,
+    turn: Any,
 ) -> tuple[ValueNet, Any, Any]:
-    """One step of the optimiser on decisions turned by these matrices (D, F, F)."""
+    """One step of the optimiser on decisions turned by this matrix (F, F)."""
     inputs = jnp.asarray(decisions.features, jnp.float32)
-    turned = decisions._replace(features=jnp.einsum("dkf,dgf->dkg", inputs, matrices))
+    turned = decisions._replace(features=inputs @ turn.T)
 
     def loss(net: ValueNet) -> jax.Array:
         return _losses(hyper, net, turned)["loss"]

@@ -25,7 +25,9 @@ from muxjax.robot import Robot, load_robot
 from muxjax.scheduler import Program, check_same_robot, schedule
 from muxjax.tendons import tendon_displacements
 
-Method = Literal["exact", "beamstep", "beamstep_printed", "sequential", "reverse", "greedy"]
+Method = Literal[
+    "exact", "beamstep", "beamstep_printed", "learned", "sequential", "reverse", "greedy"
+]
 
 
 def plan(
@@ -63,11 +65,7 @@ def plan(
         json: Print JSON in SI units.
     """
     arm = load_robot(robot)
-    fields: dict[str, Any] = {
-        "servos": servos or tuple(range(1, arm.tendons_per_segment + 1)),
-        "preset": preset,
-        "max_step": None if max_step_mm is None else max_step_mm / 1e3,
-    }
+    fields = _fields(arm, servos, preset, max_step_mm)
     if [xyz_mm, q_deg, poses].count(None) != 2:
         raise ValueError("plan: give either --xyz-mm (a pose), --q-deg or --poses")
     if xyz_mm is None and (rpy_deg is not None or quat is not None):
@@ -75,16 +73,30 @@ def plan(
     if poses is not None:
         task = load_yaml(TaskConfig, resolve(poses, "tasks"))
         return _report_path(arm, task, plan_task(arm, task, method=method, **fields), out, json)
-    choice = None
-    if xyz_mm is not None:
-        pose = pose_argument(xyz_mm, rpy_deg, quat)
-        choice = plan_to_pose(arm, pose, method=method, **fields)
-        found = choice.plan
-    else:
-        q = check_configuration(arm, np.radians(np.asarray(q_deg)))
-        problem = Problem(np.zeros(arm.n_tendons), tendon_displacements(arm, q), **fields)
-        found = plan_steps(arm, problem, method)
-    return _report_plan(arm, found, choice, out, json)
+    if xyz_mm is None:
+        return _report_plan(arm, _plan_to(arm, q_deg, method, fields), None, out, json)
+    choice = plan_to_pose(arm, pose_argument(xyz_mm, rpy_deg, quat), method=method, **fields)
+    return _report_plan(arm, choice.plan, choice, out, json)
+
+
+def _plan_to(
+    arm: Robot, q_deg: tuple[float, ...] | None, method: Method, fields: dict[str, Any]
+) -> Plan:
+    """Plan from the straight arm to a configuration [degrees]."""
+    q = check_configuration(arm, np.radians(np.asarray(q_deg)))
+    problem = Problem(np.zeros(arm.n_tendons), tendon_displacements(arm, q), **fields)
+    return plan_steps(arm, problem, method)
+
+
+def _fields(
+    arm: Robot, servos: tuple[int, ...] | None, preset: str, max_step_mm: float | None
+) -> dict[str, Any]:
+    """Fields of ``Problem`` that the command line chooses."""
+    return {
+        "servos": servos or tuple(range(1, arm.tendons_per_segment + 1)),
+        "preset": preset,
+        "max_step": None if max_step_mm is None else max_step_mm / 1e3,
+    }
 
 
 def _report_plan(
@@ -190,21 +202,50 @@ def _print_program(program: Program) -> None:
 
 
 def run(
-    program: Annotated[Path, tyro.conf.Positional],
+    program: Annotated[Path | None, tyro.conf.Positional] = None,
+    xyz_mm: Xyz | None = None,
+    rpy_deg: Xyz | None = None,
+    quat: Quaternion | None = None,
+    q_deg: tuple[float, ...] | None = None,
+    servos: tuple[int, ...] | None = None,
+    planner: Method = "exact",
+    preset: str = "paper",
+    max_step_mm: float | None = None,
     robot: str = "muxarm",
     json: bool = False,
 ) -> int:
-    """Execute a program on the virtual board, in lockstep on a virtual clock.
+    """Execute a program, or plan to a pose and execute that, on the virtual board, in lockstep.
 
-    Example: muxjax run program.json
+    Examples: muxjax run program.json; muxjax run --planner learned --q-deg 60 0 75 180 40 0
 
     Args:
         program: File written by muxjax plan --out.
+        xyz_mm: Instead of a program: tool position in the world [mm].
+        rpy_deg: Roll, pitch, yaw [degrees]; upright by default.
+        quat: Orientation as a quaternion w x y z instead.
+        q_deg: Bending angle and azimuth of each segment [degrees], instead of a pose.
+        servos: Available servos, for the plan; all by default.
+        planner: Method of the plan.
+        preset: Weights of its cost: paper, fastest, no-overshoot, or a YAML file.
+        max_step_mm: Greatest tendon displacement in one of its steps [mm]; no limit by default.
         robot: Shipped robot or path of a YAML file; a program runs only on its own robot.
         json: Print JSON in SI units.
     """
+    if [program, xyz_mm, q_deg].count(None) != 2:
+        raise ValueError("run: give either a program file, --xyz-mm (a pose) or --q-deg")
+    if xyz_mm is None and (rpy_deg is not None or quat is not None):
+        raise ValueError("run: only --xyz-mm takes --rpy-deg or --quat")
     arm = load_robot(robot)
-    loaded = load_program(program)
+    if program is not None:
+        loaded = load_program(program)
+    else:
+        fields = _fields(arm, servos, preset, max_step_mm)
+        if xyz_mm is None:
+            found = _plan_to(arm, q_deg, planner, fields)
+        else:
+            pose = pose_argument(xyz_mm, rpy_deg, quat)
+            found = plan_to_pose(arm, pose, method=planner, **fields).plan
+        loaded = schedule(arm, found)
     check_same_robot(arm, loaded)
     link = LockstepLink(arm, displacements=loaded.start, axial=loaded.axial)
     done = execute(loaded, link)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import heapq
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from itertools import count
 from time import monotonic
@@ -68,13 +67,11 @@ def beamstep(
     incumbent = min((rule(lattice) for rule in (sequential, reverse, greedy)), key=lambda p: p.cost)
     cost, steps = incumbent.cost, None
     proved, expansions = 0.0, 0
-    run = _prepared(lattice, heuristic, value_fn)
+    beam = Beam(lattice, heuristic, value_fn)
     while True:
-        found = run(width, cost)
-        if found.negative:
-            raise PlanningError("a cost term is negative; terms must be at least 0")
+        found = beam.search(width, cost)
         if found.length:
-            cost, steps = float(found.cost), _trace(lattice, found)
+            cost, steps = float(found.cost), beam.steps(found)
         proved = max(proved, min(float(found.cut_off), cost))
         expansions += int(found.expansions)
         tight = proved >= cost or (gap is not None and cost - proved <= gap * cost)
@@ -123,48 +120,63 @@ def _none_found(lattice: Lattice, width: int, proved: float, expansions: int) ->
     return failed(lattice, method="beamstep", reason=reason, expansions=expansions)
 
 
-def _prepared(
-    lattice: Lattice, heuristic: str, value_fn: ValueFunction | None
-) -> Callable[[int, float], Found]:
-    """The compiled search of a lattice, for any width and any plan to better."""
-    terms, weights = lattice.problem.compiled_terms(expensive=False)
-    expensive, their_weights = lattice.problem.compiled_terms(expensive=True)
-    with jax.enable_x64(True):
-        data = jax.device_put((lattice_arrays(lattice), bound_arrays(lattice, heuristic)))
-    value = None if value_fn is None else traced(value_fn)
+class Beam:
+    """The compiled search of one lattice, for any width and any plan to better.
 
-    def run(width: int, best: float) -> Found:
+    Args:
+        lattice: The problem on the robot.
+        heuristic: As in ``beamstep``.
+        value_fn: As in ``beamstep``.
+    """
+
+    def __init__(
+        self, lattice: Lattice, heuristic: str = "patterns", value_fn: ValueFunction | None = None
+    ) -> None:
+        self.lattice = lattice
+        self._terms = (
+            *lattice.problem.compiled_terms(expensive=False),
+            *lattice.problem.compiled_terms(expensive=True),
+        )
+        self._value = None if value_fn is None else traced(value_fn)
+        with jax.enable_x64(True):
+            self._arrays = jax.device_put(
+                (lattice_arrays(lattice), bound_arrays(lattice, heuristic))
+            )
+
+    def search(self, width: int, best: float = np.inf) -> Found:
+        """The best plan of at most ``width`` a level, if it costs less than ``best``.
+
+        Raises:
+            PlanningError: A cost term is negative.
+        """
         with jax.enable_x64(True):
             found = search(
-                lattice.robot,
-                terms,
-                weights,
-                expensive,
-                their_weights,
-                *data,
-                value,
+                self.lattice.robot,
+                *self._terms,
+                *self._arrays,
+                self._value,
                 np.int32(width),
                 np.float64(best),
                 rows=next(room for room in _ROOMS if room >= width),
-                levels=level_room(lattice),
+                levels=level_room(self.lattice),
             )
-            return jax.device_get(found)
+            found = jax.device_get(found)
+        if found.negative:
+            raise PlanningError("a cost term is negative; terms must be at least 0")
+        return found
 
-    return run
-
-
-def _trace(lattice: Lattice, found: Found) -> list[Step]:
-    """The steps of the plan that was found."""
-    actions, row = [int(found.action)], int(found.parent)
-    for level in reversed(range(int(found.length) - 1)):
-        actions.append(int(found.actions[level, row]))
-        row = int(found.parents[level, row])
-    stops, counts = lattice.actions
-    remaining, steps = lattice.steps, list[Step]()
-    for action in reversed(actions):
-        steps.append(Step(int(stops[action]), np.minimum(counts[action], remaining)))
-        remaining = remaining - steps[-1].moves
-    return steps
+    def steps(self, found: Found) -> list[Step]:
+        """The steps of the plan that was found."""
+        actions, row = [int(found.action)], int(found.parent)
+        for level in reversed(range(int(found.length) - 1)):
+            actions.append(int(found.actions[level, row]))
+            row = int(found.parents[level, row])
+        stops, counts = self.lattice.actions
+        remaining, steps = self.lattice.steps, list[Step]()
+        for action in reversed(actions):
+            steps.append(Step(int(stops[action]), np.minimum(counts[action], remaining)))
+            remaining = remaining - steps[-1].moves
+        return steps
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,7 @@ import json
 import os
 import subprocess
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import replace
 from multiprocessing import get_context
@@ -39,7 +39,6 @@ from muxjax.robot import Robot
 from training.problems import Regime, random_problem
 
 ACTIONS = 8  # of a decision: the best ones, and others at random
-_SHARD = 50  # problems
 _WANDER = 0.3  # share of random steps of the walks on which states are met
 
 
@@ -47,7 +46,7 @@ class Decisions(NamedTuple):
     """Arrays with a row a decision; missing actions have no ``exists``."""
 
     features: Float[np.ndarray, "D K F"]  # half precision
-    count: Float[np.ndarray, "D K"]  # admissible, after the action
+    bound: Float[np.ndarray, "D K"]  # admissible, without patterns, after the action
     step: Float[np.ndarray, "D K"]  # cost of the action
     to_go: Float[np.ndarray, "D K"]  # from the state after it
     arrived: Any  # (D, K): that state is the target
@@ -174,12 +173,12 @@ def decisions_of(
         stop[row, :n], remaining[row, :n] = choices.stop[kept], here - choices.moves[kept]
         step[row, :n], to_go[row, :n] = choices.cost[kept], choices.to_go[kept]
     context = context_of(Lattice(robot, problem))
-    inputs, count = features_of(robot, context, remaining.reshape(-1, robot.n_tendons), stop)
+    inputs, bound = features_of(robot, context, remaining.reshape(-1, robot.n_tendons), stop)
     exists, labelled = np.isfinite(step), np.isfinite(step + to_go)
     scale = float(context.scale)
     return Decisions(
         features=inputs.astype(np.float16).reshape(*shape, -1),
-        count=(count / scale).astype(np.float32).reshape(shape),
+        bound=(bound / scale).astype(np.float32).reshape(shape),
         step=np.where(exists, step / scale, 0.0).astype(np.float32),
         to_go=np.where(labelled, to_go / scale, 0.0).astype(np.float32),
         arrived=~remaining.any(axis=-1),
@@ -243,9 +242,19 @@ def make_shards(
     width: int,
     net: ValueNet | None = None,
     workers: int | None = None,
-    say: Callable[[str], None] = print,
+    shard: int = 50,
 ) -> None:
     """Label the problems of the regimes into a folder; shards that lie there are kept.
+
+    Args:
+        folder: Of the shards and their manifest.
+        robot: Name of a shipped robot, or path of a YAML file.
+        regimes: Kinds of problems.
+        seed: Of everything that is drawn.
+        width: Of the beam that labels by search.
+        net: Its order, if not that of the bound.
+        workers: Processes; one for each core by default.
+        shard: Problems in a shard.
 
     Raises:
         ValueError: The folder holds data of another robot, configuration or seed.
@@ -274,7 +283,7 @@ def make_shards(
     tasks = [
         _Task(folder / f"{regime.name}_{k:04d}.npz", robot, regime, width, (seed, r, k), n, net)
         for r, regime in enumerate(regimes)
-        for k, n in enumerate(_sizes(regime.problems))
+        for k, n in enumerate(_sizes(regime.problems, shard))
     ]
     open_tasks = [task for task in tasks if not task.path.is_file()]
     began, done = time.monotonic(), len(tasks) - len(open_tasks)
@@ -284,15 +293,15 @@ def make_shards(
             name, decisions = future.result()
             done += 1
             seconds = time.monotonic() - began
-            say(f"{done}/{len(tasks)} {name}: {decisions} decisions, {seconds:.0f} s")
+            print(f"{done}/{len(tasks)} {name}: {decisions} decisions, {seconds:.0f} s", flush=True)
     shards = {task.path.name: _digest(task.path) for task in tasks}
     manifest.write_text(
         json.dumps({**json.loads(manifest.read_text()), "shards": shards}, indent=1)
     )
 
 
-def _sizes(problems: int) -> list[int]:
-    return [min(_SHARD, problems - i) for i in range(0, problems, _SHARD)]
+def _sizes(problems: int, shard: int) -> list[int]:
+    return [min(shard, problems - i) for i in range(0, problems, shard)]
 
 
 def _make(task: _Task) -> tuple[str, int]:
@@ -310,7 +319,7 @@ def _make(task: _Task) -> tuple[str, int]:
     partial = task.path.with_suffix(".partial.npz")
     np.savez(partial, **whole._asdict())
     os.replace(partial, task.path)
-    return task.path.name, len(whole.count)
+    return task.path.name, len(whole.bound)
 
 
 def load_decisions(folder: Path, names: list[str] | None = None) -> Decisions:

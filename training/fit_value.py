@@ -181,7 +181,7 @@ class _Trainer:
             Decisions(*(np.concatenate(column) for column in zip(*side, strict=True)))
             for side in zip(*parts, strict=True)
         )
-        batches = max(1, len(train.count) // self.config.batch)
+        batches = max(1, len(train.bound) // self.config.batch)
         optimiser = _optimiser(self.config, batches * self.config.epochs)
         while progress.stage_epoch < self.config.epochs and progress.since < self.config.patience:
             if self.config.budget_s is not None and time.monotonic() - began > self.config.budget_s:
@@ -194,7 +194,7 @@ class _Trainer:
     ) -> Progress:
         began = time.monotonic()
         rng = np.random.default_rng([self.config.seed, int(progress.epoch)])
-        order = rng.permutation(len(train.count))
+        order = rng.permutation(len(train.bound))
         net, state, total = progress.net, progress.optimiser, 0.0
         for rows in np.array_split(order, batches):
             chosen = _sharded(Decisions(*(x[rows[: len(order) // batches]] for x in train)))
@@ -232,11 +232,11 @@ class _Trainer:
         return self.config.ranking, self.config.temperature
 
     def _scores(self, net: ValueNet, held: Decisions) -> dict[str, Any]:
-        chunks = range(0, len(held.count), 4096)
+        chunks = range(0, len(held.bound), 4096)
         parts = [
             _judged(self._hyper, net, Decisions(*(x[i : i + 4096] for x in held))) for i in chunks
         ]
-        weights = np.array([min(4096, len(held.count) - i) for i in chunks])
+        weights = np.array([min(4096, len(held.bound) - i) for i in chunks])
         return {
             name: np.average([float(part[name]) for part in parts], weights=weights)
             for name in parts[0]
@@ -259,7 +259,7 @@ def _split(folder: Path) -> tuple[Decisions, Decisions]:
 def _sharded(decisions: Decisions) -> Decisions:
     """Spread over the devices, where there are several and they divide the batch."""
     devices = jax.devices()
-    if len(devices) == 1 or len(decisions.count) % len(devices):
+    if len(devices) == 1 or len(decisions.bound) % len(devices):
         return decisions
     mesh = jax.sharding.Mesh(np.array(devices), ("batch",))
     rows = jax.sharding.NamedSharding(mesh, jax.sharding.PartitionSpec("batch"))
@@ -276,15 +276,15 @@ def _losses(
 ) -> dict[str, jax.Array]:
     """Losses, and the mean regret of the action that the network takes for the best."""
     ranking, temperature = hyper
-    rows, actions = decisions.count.shape
+    rows, actions = decisions.bound.shape
     inputs = jnp.asarray(decisions.features).reshape(rows * actions, -1)
     correction = jnp.where(decisions.arrived, 0.0, net(inputs).reshape(rows, actions))
     judged = decisions.labelled & ~decisions.arrived
-    error = correction - (decisions.to_go - decisions.count)
+    error = correction - (decisions.to_go - decisions.bound)
     value = jnp.sum(jnp.where(judged, optax.huber_loss(error, delta=_HUBER), 0.0))
     value = value / jnp.maximum(jnp.sum(judged), 1) / _HUBER
     through = decisions.step + decisions.to_go
-    guessed = decisions.step + decisions.count + correction
+    guessed = decisions.step + decisions.bound + correction
     wanted = jax.nn.softmax(jnp.where(decisions.labelled, -through / temperature, -jnp.inf))
     found = jax.nn.log_softmax(jnp.where(decisions.exists, -guessed / temperature, -1e9))
     rank = -jnp.mean(jnp.sum(wanted * jnp.where(decisions.exists, found, 0.0), axis=1))

@@ -11,6 +11,7 @@ from muxjax.planning.lattice import Lattice
 from muxjax.planning.motion import angles_at
 from muxjax.planning.patterns import Prices, VisitPattern
 from muxjax.planning.problem import TERMS
+from muxjax.planning.stop_patterns import StopPattern, stop_pattern
 
 
 class AdmissibleBound:
@@ -56,25 +57,40 @@ class AdmissibleBound:
             if name in by_term:
                 total = total + weight * by_term[name]
         more = known = self._weights.get("bending", 0.0) * by_term["bending"]
-        for pattern in self._patterns:
+        if self._pattern is not None:
+            price = self._prices.switch  # switches are in the total already
+            more = np.maximum(more, self._pattern(remaining, stop) - price * stops)
+        for pattern in self._coarse_patterns:
             more = np.maximum(more, pattern(remaining, stop, visits))
         return total + (more - known)
 
     @cached_property
-    def _patterns(self) -> list[VisitPattern]:
-        robot, weights = self._lattice.robot, self._weights
-        if not (weights.get("bending") or weights.get("overshoot")):
-            return []
-        seconds = float(robot.switch_time)
-        prices = Prices(
+    def _prices(self) -> Prices:
+        weights, seconds = self._weights, float(self._lattice.robot.switch_time)
+        return Prices(
             bending=weights.get("bending", 0.0),
             switch=weights.get("switches", 0.0) + seconds * weights.get("time", 0.0),
             waiting=seconds * weights.get("overshoot", 0.0),
         )
-        goal = angles_at(robot, self._lattice.problem.target[None])[0]
+
+    @cached_property
+    def _goal(self) -> Float[np.ndarray, " S"]:
+        return angles_at(self._lattice.robot, self._lattice.problem.target[None])[0]
+
+    @cached_property
+    def _pattern(self) -> StopPattern | None:
+        prices = self._prices
+        return stop_pattern(self._lattice, prices, self._goal) if any(prices) else None
+
+    @cached_property
+    def _coarse_patterns(self) -> list[VisitPattern]:
+        """Where the lattice has no finer pattern."""
+        prices = self._prices
+        if self._pattern is not None or not (prices.bending or prices.waiting):
+            return []
         one_servo = int(self._lattice.reach.sum(axis=1).max()) == 1  # the two are then the same
         return [
-            VisitPattern(self._lattice, prices, goal, in_actions=kind)
+            VisitPattern(self._lattice, prices, self._goal, in_actions=kind)
             for kind in ((False,) if one_servo else (False, True))
         ]
 

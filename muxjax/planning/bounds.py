@@ -84,11 +84,13 @@ class AdmissibleBound:
 
     @cached_property
     def _coarse_patterns(self) -> list[VisitPattern]:
-        """Where the lattice has no finer pattern."""
-        prices = self._prices
-        if self._pattern is not None or not (prices.bending or prices.waiting):
+        """Where the lattice has no finer pattern, or one servo and a pattern of wide cells."""
+        prices, finer = self._prices, self._pattern
+        one_servo = int(self._lattice.reach.sum(axis=1).max()) == 1
+        enough = finer is not None and not (one_servo and finer.wide)
+        if enough or not (prices.bending or prices.waiting):
             return []
-        one_servo = int(self._lattice.reach.sum(axis=1).max()) == 1  # the two are then the same
+        # With one servo steps and actions are the same.
         return [
             VisitPattern(self._lattice, prices, self._goal, in_actions=kind)
             for kind in ((False,) if one_servo else (False, True))

@@ -60,12 +60,8 @@ def layer_classes(lattice: Lattice, layer: int) -> LayerClasses:
     left = np.indices([int(n) + 1 for n in steps]).reshape(j, -1).T
     remaining = np.zeros((len(left), lattice.robot.n_tendons), dtype=np.int64)
     remaining[:, columns] = left
-    servos = int(lattice.reach.sum(axis=1).max())
-    needed, status, partly = (
-        _needed(lattice, left, servos),
-        _status(left, steps, servos),
-        ((left > 0) & (left < steps)).sum(axis=1),
-    )
+    needed = _needed(lattice, left, int(lattice.reach.sum(axis=1).max()))
+    status, partly = _status(left, steps), ((left > 0) & (left < steps)).sum(axis=1)
     key = status * (int(needed.max()) + 1) + needed
     _, first, of_state = np.unique(key, return_index=True, return_inverse=True)
     stops = np.flatnonzero(lattice.reach[:, columns].any(axis=1))
@@ -88,17 +84,10 @@ def _needed(lattice: Lattice, left: Int[np.ndarray, "P J"], servos: int) -> Int[
     return np.asarray(np.maximum(left.max(axis=-1), -(-left.sum(axis=-1) // servos)))
 
 
-def _status(
-    left: Int[np.ndarray, "P J"], steps: Int[np.ndarray, " J"], servos: int
-) -> Int[np.ndarray, " P"]:
-    """Base 3, a digit a tendon: 0 done, 1 on its way, 2 untouched.
-
-    More tendons on their way than servos cost further switches: such states share a number, as
-    long as the same number is untouched.
-    """
+def _status(left: Int[np.ndarray, "P J"], steps: Int[np.ndarray, " J"]) -> Int[np.ndarray, " P"]:
+    """Base 3, a digit a tendon: 0 done, 1 on its way, 2 untouched."""
     digits = np.where(left == 0, 0, np.where(left == steps, 2, 1))
-    number = digits @ 3 ** np.arange(left.shape[1])
-    return number
+    return np.asarray(digits @ 3 ** np.arange(left.shape[1]))
 
 
 def _leads(

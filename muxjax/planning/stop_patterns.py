@@ -21,9 +21,9 @@ from muxjax.planning.layer_classes import Cells, LayerClasses, cells, layer_clas
 from muxjax.planning.motion import STRAIGHT
 from muxjax.planning.patterns import Prices
 
-MOST_VALUES = 3_000_000
-VALUES_PER_STEP = 20_000  # of the lattice; coarse ones need no more and are to stay fast
-_SIZES = (1, 2, 3, 4, 6, 8, 12, 16)  # actions to a cell
+MOST_COMBINATIONS = 2_500_000  # of classes and cells; beyond, cells are widened
+COMBINATIONS_PER_STEP = 18_000  # of the lattice; coarse ones need no more and are to stay fast
+_SIZES = (1, 2, 3, 4, 6, 8, 12, 16, 24, 48)  # actions to a cell
 
 
 class _Layer(NamedTuple):
@@ -61,6 +61,9 @@ class StopPattern:
         joined: Their cells.
         prices: What is charged.
         goal: Bending of the target [rad], above which a segment overshoots.
+
+    Attributes:
+        wide: Whether some cell has several classes.
     """
 
     def __init__(
@@ -72,6 +75,7 @@ class StopPattern:
         goal: Float[np.ndarray, " S"],
     ) -> None:
         n = len(classes)
+        self.wide = any(cell.rank.max() > 0 for cell in joined)
         steps = [_bending(lattice, classes, joined, i) * prices.bending for i in range(n)]
         self._layers = [
             _Layer(c, j, _toll(c, step.min(axis=tuple(a for a in range(n) if a != i))))
@@ -129,12 +133,12 @@ def stop_pattern(
         return None
     classes = [layer_classes(lattice, i) for i in range(min(robot.n_segments, 3))]
     servos = int(lattice.reach.sum(axis=1).max())
-    most = min(MOST_VALUES, VALUES_PER_STEP * int(lattice.steps.sum()))
+    most = min(MOST_COMBINATIONS, COMBINATIONS_PER_STEP * int(lattice.steps.sum()))
     for size in _SIZES:
         # Three servos seldom leave a single tendon on its way.
         joined = [cells(c, (size if servos < 3 else 2 * size, size)) for c in classes]
         counts = np.array([j.count for j in joined])
-        moving = [len(c.needed) * len(c.stops) for c in classes] / counts
+        moving = [len(c.needed) for c in classes] / counts
         if np.prod(counts) * moving.sum() <= most:
             return StopPattern(lattice, classes, joined, prices, goal)
     return None

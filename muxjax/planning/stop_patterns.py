@@ -21,8 +21,8 @@ from muxjax.planning.layer_classes import Cells, LayerClasses, cells, layer_clas
 from muxjax.planning.motion import STRAIGHT
 from muxjax.planning.patterns import Prices
 
-MOST_COMBINATIONS = 2_500_000  # of classes and cells; beyond, cells are widened
-COMBINATIONS_PER_STEP = 18_000  # of the lattice; coarse ones need no more and are to stay fast
+MOST_COMBINATIONS = 3_000_000  # of classes and cells; beyond, cells are widened
+COMBINATIONS_PER_STEP = 24_000  # of the lattice; coarse ones need no more and are to stay fast
 _SIZES = (1, 2, 3, 4, 6, 8, 12, 16, 24, 48)  # actions to a cell
 
 

@@ -23,7 +23,7 @@ class AdmissibleBound:
       engagement without repositioning is left out);
     - bending: the last step ends at the target's bending, and a pattern database knows more; so it
       does about switches beyond those needed, and about overshoot while the drum moves
-      (``patterns.py``);
+      (``stop_patterns.py``, or ``patterns.py`` where that does not fit);
     - other terms, and overshoot while tendons move: nothing, which is a bound because no term may
       be negative.
     """
@@ -84,10 +84,11 @@ class AdmissibleBound:
 
     @cached_property
     def _coarse_patterns(self) -> list[VisitPattern]:
-        """Where the lattice has no finer pattern, or one servo and a pattern of wide cells."""
+        """Where there is no finer pattern; beside one of wide cells, where they often know more."""
         prices, finer = self._prices, self._pattern
         one_servo = int(self._lattice.reach.sum(axis=1).max()) == 1
-        enough = finer is not None and not (one_servo and finer.wide)
+        helps = one_servo or prices.waiting > 0
+        enough = finer is not None and not (finer.wide and helps)
         if enough or not (prices.bending or prices.waiting):
             return []
         # With one servo steps and actions are the same.

@@ -58,8 +58,9 @@ class AdmissibleBound:
                 total = total + weight * by_term[name]
         more = known = self._weights.get("bending", 0.0) * by_term["bending"]
         if self._pattern is not None:
-            price = self._prices.switch  # switches are in the total already
-            more = np.maximum(more, self._pattern(remaining, stop) - price * stops)
+            # Of its switches, which are those into the layers that it knows, some are in the total.
+            counted = self._prices.switch * visits[:, : self._pattern.layers].sum(axis=-1)
+            more = np.maximum(more, self._pattern(remaining, stop) - counted)
         for pattern in self._coarse_patterns:
             more = np.maximum(more, pattern(remaining, stop, visits))
         return total + (more - known)

@@ -53,7 +53,7 @@ class _Moving(NamedTuple):
 
 
 class StopPattern:
-    """Lower bound on the bending still to come, and on all switches.
+    """Lower bound on the bending still to come, and on switches into the layers it knows.
 
     Args:
         lattice: The problem on the robot.
@@ -63,6 +63,7 @@ class StopPattern:
         goal: Bending of the target [rad], above which a segment overshoots.
 
     Attributes:
+        layers: How many layers, from the base, it knows.
         wide: Whether some cell has several classes.
     """
 
@@ -74,7 +75,7 @@ class StopPattern:
         prices: Prices,
         goal: Float[np.ndarray, " S"],
     ) -> None:
-        n = len(classes)
+        self.layers = n = len(classes)
         self.wide = any(cell.rank.max() > 0 for cell in joined)
         steps = [_bending(lattice, classes, joined, i) * prices.bending for i in range(n)]
         self._layers = [

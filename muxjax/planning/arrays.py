@@ -6,7 +6,9 @@ databases) is data, padded to sizes that many problems share: so one compilation
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from functools import reduce
+from itertools import product
 from typing import Any, NamedTuple
 
 import jax
@@ -14,9 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from muxjax.planning.bounds import bound_of
 from muxjax.planning.lattice import Lattice
-from muxjax.planning.patterns import VisitPattern
 
 Array = Any  # jax.Array | np.ndarray; mypy knows no operators of their union
 
@@ -51,18 +51,8 @@ class LatticeArrays(NamedTuple):
         return jnp.where(possible[..., None], made, 0)
 
 
-class PatternArrays(NamedTuple):
-    """One pattern database; indices are offsets into its flat values. P: states of a layer."""
-
-    value: Float[Array, " values"]
-    place: Int[Array, " stops"]  # of the stop; the last one where it is not known
-    visits: Int[Array, " S"]  # counted at most
-    visit: Int[Array, " S"]  # of one visit
-    state: Int[Array, "S P"]  # of a layer's state
-
-
 class Needs(NamedTuple):
-    """What is still needed, by layer; arrays with a row a state."""
+    """What is still needed, by layer (or by what else may share a step); a row a state."""
 
     way: list[Float[Array, " N"]]  # of all its tendons [m]
     shortest: list[Float[Array, " N"]]  # of the servos, if they could always work together [m]
@@ -70,13 +60,36 @@ class Needs(NamedTuple):
     state: list[Int[Array, " N"]]  # number of the layer's state
 
 
+class PatternArrays(NamedTuple):
+    """A pattern database. P: states of a layer; a layout is the order of some stops' values."""
+
+    value: Float[Array, " values"]
+    begin: Int[Array, " stops"]  # of the stop's values; the last one is for no stop
+    layout: Int[Array, " stops"]
+    place: Int[Array, "layouts S P"]  # offset by a layer's state
+    toll: Float[Array, "layouts S P"]  # to be added, by a layer's state
+    visits: Int[Array, " S"]  # that values tell apart
+    visit: Int[Array, " S"]  # offset by a visit
+    counted: Float[Array, " S"]  # price of a visit that values hold and the bound counts too
+
+    def __call__(self, needs: Needs, stop: Int[Array, " N"], xp: Any) -> Float[Array, " N"]:
+        """Bound on what the count leaves out, at states."""
+        at, layout = self.begin[stop], self.layout[stop]
+        more = 0.0
+        for layer, (visits, state) in enumerate(zip(needs.visits, needs.state, strict=True)):
+            at = at + self.place[layout, layer, state]
+            at = at + xp.minimum(visits, self.visits[layer]) * self.visit[layer]
+            more = more + self.toll[layout, layer, state] - self.counted[layer] * visits
+        return self.value[at] + more
+
+
 class BoundArrays(NamedTuple):
-    """``bounds.AdmissibleBound`` of a lattice: weights, and what they multiply."""
+    """An admissible bound (``bounds.AdmissibleBound``): weights, and what they multiply."""
 
     travel: Float[Array, ""]
     stop: Float[Array, ""]  # of a stop: switch and repositioning time
     second: Float[Array, ""]
-    bending: Float[Array, ""]  # of the last step
+    last: Float[Array, ""]  # bending of the last step
     speed: Float[Array, ""]  # of a tendon [m/s]
     reach: Bool[Array, "stops SJ"]  # the last row, of no stop, is empty
     servos: Int[Array, ""]  # most tendons in a step
@@ -84,36 +97,36 @@ class BoundArrays(NamedTuple):
     patterns: tuple[PatternArrays, ...]
 
     def needs(
-        self, lattice: LatticeArrays, remaining: Int[Array, "N SJ"], stop: Int[Array, " N"]
+        self, lattice: LatticeArrays, remaining: Int[Array, "N SJ"], stop: Int[Array, " N"], xp: Any
     ) -> Needs:
-        """What states need by layer, or by what else may share a step."""
+        """What states need."""
         # A column a tendon: whole rows of memory for the compiler, which short axes are not.
         left, here = remaining.T, self.reach[stop].T
-        way = [jnp.abs(lattice.way[c][k]) for c, k in enumerate(left)]
+        way = [xp.abs(lattice.way[c][k]) for c, k in enumerate(left)]
         per_layer = self.layer_index.shape[1]
         needs = Needs([], [], [], [])
         for index, first in zip(self.layer_index, range(0, len(way), per_layer), strict=True):
             tendons = range(first, first + per_layer)
             needs.way.append(sum(way[c] for c in tendons))
-            longest = reduce(jnp.maximum, [way[c] for c in tendons])
-            needs.shortest.append(jnp.maximum(longest, needs.way[-1] / self.servos))
+            longest = reduce(xp.maximum, [way[c] for c in tendons])
+            needs.shortest.append(xp.maximum(longest, needs.way[-1] / self.servos))
             elsewhere = sum(((left[c] > 0) & ~here[c]).astype(stop.dtype) for c in tendons)
             needs.visits.append(-(-elsewhere // self.servos))
             needs.state.append(sum(left[c] * index[c - first] for c in tendons))
         return needs
 
     def __call__(
-        self, lattice: LatticeArrays, remaining: Int[Array, "N SJ"], stop: Int[Array, " N"]
+        self,
+        lattice: LatticeArrays,
+        remaining: Int[Array, "N SJ"],
+        stop: Int[Array, " N"],
+        xp: Any = jnp,
     ) -> Float[Array, " N"]:
-        """Bound at states."""
-        needs = self.needs(lattice, remaining, stop)
-        more = self.bending * jnp.any(remaining > 0, axis=-1)
+        """Bound at states; with ``xp=numpy`` on the host."""
+        needs = self.needs(lattice, remaining, stop, xp)
+        more = self.last * xp.any(remaining > 0, axis=-1)
         for pattern in self.patterns:
-            at = pattern.place[stop]
-            for layer, (count, state) in enumerate(zip(needs.visits, needs.state, strict=True)):
-                counted = jnp.minimum(count, pattern.visits[layer])
-                at = at + counted * pattern.visit[layer] + pattern.state[layer][state]
-            more = jnp.maximum(more, pattern.value[at])
+            more = xp.maximum(more, pattern(needs, stop, xp))
         return (
             self.travel * sum(needs.way)
             + self.stop * sum(needs.visits)
@@ -164,57 +177,88 @@ def level_room(lattice: Lattice) -> int:
     return _room(int(lattice.steps.sum()), _LEVELS)
 
 
-def bound_arrays(lattice: Lattice, heuristic: str) -> BoundArrays:
-    """Bound of a lattice, or a part of it: see ``beamstep.beamstep``."""
-    robot, bound = lattice.robot, bound_of(lattice)
-    weights = {} if heuristic == "none" else bound.weights
-    groups = robot.n_segments if lattice.one_layer_a_step else 1
-    steps = lattice.steps.reshape(groups, -1)
+def pattern_arrays(
+    lattice: Lattice,
+    value: Float[np.ndarray, " values"],
+    begin: Int[np.ndarray, " known"],
+    layout: Int[np.ndarray, " known"],
+    place: list[list[Int[np.ndarray, " _"]]],
+    *,
+    toll: list[list[Float[np.ndarray, " _"]]] | None = None,
+    visits: Int[np.ndarray, " layers"] | None = None,
+    visit: Int[np.ndarray, " layers"] | None = None,
+    counted: float = 0.0,
+) -> PatternArrays:
+    """A pattern database of the first layers of a lattice.
+
+    Args:
+        lattice: The problem on the robot.
+        value: All values.
+        begin: Of each stop's values; the last one is for no stop.
+        layout: Of each stop's values, likewise.
+        place: By layout and layer, the offset by the layer's state.
+        toll: What is to be added to a value, likewise.
+        visits: That values tell apart, by layer.
+        visit: Offset by a visit, by layer.
+        counted: Price of a visit, of the layers known, that values hold and the bound counts too.
+    """
+    s, layers = lattice.robot.n_segments, len(place[0])
+    states = _room(max(len(p) for row in place for p in row), _STATES, 16)
+    stops = len(lattice.robot.axial_map) + 1
+    places, tolls = np.zeros((2, len(place), s, states))
+    for (i, row), (j, _) in product(enumerate(place), enumerate(place[0])):
+        places[i, j, : len(row[j])] = row[j]
+        if toll is not None:
+            tolls[i, j, : len(row[j])] = toll[i][j]
+
+    def of_stops(known: np.ndarray) -> np.ndarray:
+        return np.append(known, np.full(stops - len(known), known[-1]))
+
+    def of_layers(known: np.ndarray | None) -> np.ndarray:
+        return np.zeros(s, int) if known is None else np.append(known, np.zeros(s - layers, int))
+
+    return PatternArrays(
+        value=_padded(value, _room(len(value), _VALUES, 16)),
+        begin=_short(of_stops(begin)),
+        layout=_short(of_stops(layout)),
+        place=_short(places.astype(np.int64)),
+        toll=tolls,
+        visits=_short(of_layers(visits)),
+        visit=_short(of_layers(visit)),
+        counted=np.where(np.arange(s) < layers, counted, 0.0),
+    )
+
+
+def bound_arrays(
+    lattice: Lattice, weights: Mapping[str, float], last: float, patterns: list[PatternArrays]
+) -> BoundArrays:
+    """A bound.
+
+    Args:
+        lattice: The problem on the robot.
+        weights: Of the terms that it knows.
+        last: Bending of the target [rad^2].
+        patterns: Databases that know more of bending, switches and overshoot.
+    """
+    robot = lattice.robot
+    steps = lattice.steps.reshape(robot.n_segments if lattice.one_layer_a_step else 1, -1)
     index = np.ones_like(steps)
     index[:, :-1] = np.cumprod(steps[:, :0:-1] + 1, axis=1)[:, ::-1]
-    stops = len(robot.axial_map) + 1  # and one for no stop
-    known = bound.patterns if heuristic == "patterns" else []
-    patterns = [_pattern_arrays(p, lattice, stops) for p in known if p.layers]
     seconds = weights.get("time", 0.0)
-    found = BoundArrays(
-        travel=weights.get("travel", 0.0),
-        stop=weights.get("switches", 0.0) + float(robot.switch_time) * seconds,
-        second=seconds,
-        bending=weights.get("bending", 0.0) * np.sum(bound.end_angles**2),
-        speed=robot.tendon_speed,
-        reach=_padded(lattice.reach, stops),
-        servos=np.asarray(lattice.reach.sum(axis=-1).max()),
-        layer_index=index,
-        patterns=(*patterns, *[_no_pattern(groups, stops)] * (2 - len(patterns))),
+    return BoundArrays(
+        travel=_short(weights.get("travel", 0.0)),
+        stop=_short(weights.get("switches", 0.0) + float(robot.switch_time) * seconds),
+        second=_short(seconds),
+        last=_short(weights.get("bending", 0.0) * last),
+        speed=_short(robot.tendon_speed),
+        reach=_padded(lattice.reach, len(robot.axial_map) + 1),
+        servos=_short(lattice.reach.sum(axis=-1).max()),
+        layer_index=_short(index),
+        patterns=tuple(patterns),
     )
-    return jax.tree.map(_short, found)
 
 
 def _short(leaf: Any) -> np.ndarray:
     """As an array, integers in 32 bits: they are gathered twice as fast."""
     array = np.asarray(leaf)
     return array.astype(np.int32) if array.dtype == np.int64 else array
-
-
-def _no_pattern(groups: int, stops: int) -> PatternArrays:
-    nothing, states = np.zeros(groups, int), np.zeros((groups, _STATES), int)
-    return PatternArrays(np.zeros(_VALUES), np.zeros(stops, int), nothing, nothing, states)
-
-
-def _pattern_arrays(p: VisitPattern, lattice: Lattice, stops: int) -> PatternArrays:
-    s, layers = lattice.robot.n_segments, p.layers
-    shape = p._value.shape
-    stride = np.cumprod(np.append(1, shape[:0:-1]))[::-1]
-    layer_of_stop = lattice.reach.reshape(len(lattice.reach), s, -1)
-    place = np.minimum(np.argmax(layer_of_stop.any(axis=-1), axis=-1), layers)
-    place = np.append(place, np.full(stops - len(place), layers))
-    visits, visit = np.zeros(s, int), np.zeros(s, int)
-    visits[:layers], visit[:layers] = np.array(shape[1 : 1 + layers]) - 1, stride[1 : 1 + layers]
-    classes = [p._points(i)[1] for i in range(layers)]
-    state = np.zeros((s, _room(max(map(len, classes)), _STATES, 16)), int)
-    for i, of_state in enumerate(classes):
-        state[i, : len(of_state)] = of_state * stride[1 + layers + i]
-    values = p._value.reshape(-1)
-    return PatternArrays(
-        _padded(values, _room(len(values), _VALUES, 16)), place * stride[0], visits, visit, state
-    )

@@ -11,8 +11,9 @@ import jax
 import numpy as np
 from jaxtyping import Int
 
-from muxjax.planning.arrays import bound_arrays, lattice_arrays, level_room
+from muxjax.planning.arrays import lattice_arrays, level_room
 from muxjax.planning.baselines import greedy, reverse, sequential
+from muxjax.planning.bounds import bound_of
 from muxjax.planning.lattice import Lattice
 from muxjax.planning.problem import Plan, PlanningError
 from muxjax.planning.replay import Step, failed, replay
@@ -140,7 +141,7 @@ class Beam:
         self._value = None if value_fn is None else traced(value_fn)
         with jax.enable_x64(True):
             self._arrays = jax.device_put(
-                (lattice_arrays(lattice), bound_arrays(lattice, heuristic))
+                (lattice_arrays(lattice), bound_of(lattice).arrays(heuristic))
             )
 
     def search(self, width: int, best: float = np.inf) -> Found:

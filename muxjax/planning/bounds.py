@@ -5,12 +5,20 @@ from __future__ import annotations
 from functools import cached_property, lru_cache
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 
+from muxjax.planning.arrays import (
+    BoundArrays,
+    LatticeArrays,
+    PatternArrays,
+    bound_arrays,
+    lattice_arrays,
+)
 from muxjax.planning.lattice import Lattice
 from muxjax.planning.motion import angles_at
-from muxjax.planning.patterns import Prices, VisitPattern
+from muxjax.planning.patterns import Prices, visit_pattern
 from muxjax.planning.problem import TERMS
+from muxjax.planning.stop_patterns import stop_pattern
 
 
 class AdmissibleBound:
@@ -22,7 +30,7 @@ class AdmissibleBound:
       engagement without repositioning is left out);
     - bending: the last step ends at the target's bending, and a pattern database knows more; so it
       does about switches beyond those needed, and about overshoot while the drum moves
-      (``patterns.py``);
+      (``stop_patterns.py``, or ``patterns.py`` where that does not fit);
     - other terms, and overshoot while tendons move: nothing, which is a bound because no term may
       be negative.
     """
@@ -31,7 +39,7 @@ class AdmissibleBound:
         self._lattice = lattice
         problem = lattice.problem
         # A user's term may take the name of a shipped one; no bound is known for it.
-        self.weights = {
+        self._weights = {
             name: problem.cost_weights[name]
             for name, term in problem.weighted_terms
             if term is TERMS.get(name)
@@ -41,74 +49,59 @@ class AdmissibleBound:
         self, remaining: Int[np.ndarray, "N SJ"], stop: Int[np.ndarray, " N"]
     ) -> Float[np.ndarray, " N"]:
         """Bound at states: steps that each tendon has to go, and the present stop, or -1."""
-        unfinished = remaining > 0
-        residual = np.abs(self._end - self._lattice.displacements(remaining)) * unfinished
-        visits = self._stops_needed(unfinished, stop)
-        stops = visits.sum(axis=-1)
-        by_term = {
-            "travel": residual.sum(axis=-1),
-            "switches": stops,
-            "time": stops * float(self._lattice.robot.switch_time) + self._motion_time(residual),
-            "bending": unfinished.any(axis=-1) * float(np.sum(self.end_angles**2)),
-        }
-        total = np.zeros(len(remaining))
-        for name, weight in self.weights.items():
-            if name in by_term:
-                total = total + weight * by_term[name]
-        more = known = self.weights.get("bending", 0.0) * by_term["bending"]
-        for pattern in self.patterns:
-            more = np.maximum(more, pattern(remaining, stop, visits))
-        return total + (more - known)
+        return np.asarray(self.arrays()(self._lattice_arrays, remaining, stop, np))
+
+    def arrays(self, heuristic: str = "patterns") -> BoundArrays:
+        """The bound, or a part of it, for compiled searches.
+
+        Args:
+            heuristic: "patterns" for all of it, "count" for what needs no pattern database, "none"
+                for zero.
+        """
+        weights = {} if heuristic == "none" else self._weights
+        patterns = self._patterns if heuristic == "patterns" else []
+        return bound_arrays(self._lattice, weights, self._last, patterns)
 
     @cached_property
-    def patterns(self) -> list[VisitPattern]:
-        """Pattern databases; none where neither bending nor overshoot counts."""
-        robot, weights = self._lattice.robot, self.weights
-        if not (weights.get("bending") or weights.get("overshoot")):
-            return []
-        seconds = float(robot.switch_time)
-        prices = Prices(
+    def _lattice_arrays(self) -> LatticeArrays:
+        return lattice_arrays(self._lattice)
+
+    @cached_property
+    def _last(self) -> float:
+        """Sum of theta^2 [rad^2] where clipped moves end: the target, up to the tolerance."""
+        end = self._lattice.displacements(np.zeros_like(self._lattice.steps))
+        return float(np.sum(angles_at(self._lattice.robot, end[None]) ** 2))
+
+    @cached_property
+    def _prices(self) -> Prices:
+        weights, seconds = self._weights, float(self._lattice.robot.switch_time)
+        return Prices(
             bending=weights.get("bending", 0.0),
             switch=weights.get("switches", 0.0) + seconds * weights.get("time", 0.0),
             waiting=seconds * weights.get("overshoot", 0.0),
         )
-        goal = angles_at(robot, self._lattice.problem.target[None])[0]
-        one_servo = int(self._lattice.reach.sum(axis=1).max()) == 1  # the two are then the same
-        return [
-            VisitPattern(self._lattice, prices, goal, in_actions=kind)
-            for kind in ((False,) if one_servo else (False, True))
-        ]
 
     @cached_property
-    def _end(self) -> Float[np.ndarray, " SJ"]:
-        """Where clipped moves end: the target, up to the tolerance."""
-        return self._lattice.displacements(np.zeros_like(self._lattice.steps))
+    def _patterns(self) -> list[PatternArrays]:
+        """The finer pattern, and coarse ones in its place or, where its cells are wide, beside it.
 
-    @cached_property
-    def end_angles(self) -> Float[np.ndarray, " S"]:
-        """Bending angles [rad] where clipped moves end."""
-        return angles_at(self._lattice.robot, self._end[None])[0]
-
-    def _by_layer(self, values: np.ndarray) -> np.ndarray:
-        """Tendons that may share a step, in a group each: the layers, or else all in one."""
-        robot = self._lattice.robot
-        if not self._lattice.one_layer_a_step:
-            return values[:, None, :]
-        return values.reshape(-1, robot.n_segments, robot.tendons_per_segment)
-
-    def _stops_needed(
-        self, unfinished: Bool[np.ndarray, "N SJ"], stop: Int[np.ndarray, " N"]
-    ) -> Int[np.ndarray, "N groups"]:
-        reach = self._lattice.reach
-        here = np.where((stop >= 0)[:, None], reach[stop], False)
-        elsewhere = self._by_layer(unfinished & ~here).sum(axis=-1)
-        return np.ceil(elsewhere / reach.sum(axis=-1).max()).astype(np.int64)
-
-    def _motion_time(self, residual: Float[np.ndarray, "N SJ"]) -> Float[np.ndarray, " N"]:
-        layers = self._by_layer(residual)
-        servos = self._lattice.reach.sum(axis=-1).max()
-        shortest = np.maximum(layers.max(axis=-1), layers.sum(axis=-1) / servos)
-        return shortest.sum(axis=-1) / float(self._lattice.robot.tendon_speed)
+        Beside it they know more only with one servo, or with a price on overshoot.
+        """
+        lattice, prices = self._lattice, self._prices
+        if not any(prices):
+            return []
+        goal = angles_at(lattice.robot, lattice.problem.target[None])[0]
+        finer = stop_pattern(lattice, prices, goal)
+        one_servo = int(lattice.reach.sum(axis=1).max()) == 1
+        helps = one_servo or prices.waiting > 0
+        enough = finer is not None and not (finer.wide and helps)
+        found = [] if finer is None else [finer.arrays()]
+        if not enough and (prices.bending or prices.waiting):
+            # With one servo steps and actions are the same.
+            for kind in (False,) if one_servo else (False, True):
+                pattern = visit_pattern(lattice, prices, goal, in_actions=kind)
+                found += [] if pattern is None else [pattern]
+        return found
 
 
 @lru_cache(maxsize=1)

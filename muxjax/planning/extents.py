@@ -104,12 +104,54 @@ def least_angles(robot: Robot, layers: list[Extents]) -> Least:
             apart = along(layer.least, 0)
         else:
             nearest = -np.roll(layer.furthest, _DIRECTIONS // 2, axis=1)  # least along directions
-            gap = (nearest - through[i - 1][..., None, :]).max(axis=-1)
-            apart = np.maximum(gap, 0.0).reshape(*gap.shape, *(1,) * (n - gap.ndim))
+            gap = np.zeros((*through[i - 1].shape[:-1], len(nearest)))
+            for k in range(_DIRECTIONS):
+                np.maximum(gap, nearest[:, k] - through[i - 1][..., k, None], out=gap)
+            apart = gap.reshape(*gap.shape, *(1,) * (n - gap.ndim))
         arc = np.maximum(along(layer.arc, i) + slack[i], 1e-9)
-        angles.append(apart * lengths[i] / (float(robot.tendon_radius) * arc))
+        angles.append(apart * (lengths[i] / (float(robot.tendon_radius) * arc)))
         empty = empty | along(layer.empty, i)
-    return Least(angles, sum((a**2 for a in angles), start=np.zeros(())), empty)
+    squares = [angle**2 for angle in angles]
+    bending = sum(squares, start=np.zeros(()))
+    for together in _together(robot, layers, through, squares, arc):
+        np.maximum(bending, together, out=bending)
+    return Least(angles, bending, empty)
+
+
+def _together(
+    robot: Robot,
+    layers: list[Extents],
+    through: list[np.ndarray],
+    squares: list[np.ndarray],
+    arc: np.ndarray,
+) -> list[np.ndarray]:
+    """Other lower bounds on the sum of squares, with some segments taken together.
+
+    Of what goes on behind segment i, y_i = y_(i-1) + kappa_i v_i with v_i the harmonic left for
+    it: so theta_i = |v_i| L_i / (r_a arc_i) >= |y_i - y_(i-1)| / r_a, as kappa_i is a sinc times
+    L_i / arc_i. And the squares of parts of a vector, each with a factor, are at least the square
+    of the vector over the sum of the factors' inverses.
+    """
+    n, radius = len(layers), float(robot.tendon_radius)
+    if n == 1:
+        return []
+
+    def along(values: np.ndarray, *axes: int) -> np.ndarray:
+        shape = [1] * n
+        for axis, size in zip(axes, values.shape, strict=True):
+            shape[axis] = size
+        return values.reshape(shape)
+
+    found, last = [], layers[-1]
+    inverse = (radius * arc / float(robot.length[n - 1])) ** 2  # of the last segment's factor
+    found.append(along(last.least, n - 1) ** 2 / ((n - 1) * radius**2 + inverse))
+    if n == 3:
+        nearest = -np.roll(last.furthest, _DIRECTIONS // 2, axis=1)
+        apart = np.maximum((nearest - through[0][:, None, :]).max(axis=-1), 0.0)
+        found.append(squares[0] + along(apart, 0, 2) ** 2 / (radius**2 + inverse))
+        far = np.maximum(-through[1].min(axis=-1), 0.0)
+        found.append(along(far, 0, 1) ** 2 / (2 * radius**2) + squares[2])
+    return found
 
 
 def _slack(robot: Robot, layers: list[Extents]) -> list[float]:

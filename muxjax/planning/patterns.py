@@ -19,6 +19,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
+from muxjax.planning.arrays import PatternArrays, pattern_arrays
 from muxjax.planning.extents import extents, least_angles, runs_straight
 from muxjax.planning.lattice import Lattice
 from muxjax.planning.motion import STRAIGHT
@@ -36,7 +37,9 @@ class Prices(NamedTuple):
     waiting: float  # of relative overshoot while the drum moves
 
 
-class VisitPattern:
+def visit_pattern(
+    lattice: Lattice, prices: Prices, goal: Float[np.ndarray, " S"], *, in_actions: bool
+) -> PatternArrays | None:
     """Lower bound on the bending still to come, and on switches beyond those that are counted.
 
     Args:
@@ -45,81 +48,56 @@ class VisitPattern:
         goal: Bending of the target [rad], above which a segment overshoots.
         in_actions: What a layer needs is counted in actions, else in steps.
 
-    Attributes:
-        layers: How many layers, from the base, the grid has; 0 where there is no pattern.
+    Returns:
+        The pattern of at most three layers, from the base; None where there is none.
     """
+    robot = lattice.robot
+    servos = int(lattice.reach.sum(axis=1).max())
+    steps = lattice.steps.reshape(robot.n_segments, -1)
+    few = np.prod(steps + 1.0, axis=1).max() <= MOST_STATES
+    if not (lattice.one_layer_a_step and few):
+        return None
+    layers = min(robot.n_segments, 3)
+    points = [_points(lattice, layer, servos, in_actions) for layer in range(layers)]
+    if not (runs_straight(robot) or pairs_fit(points)):
+        return None
+    node, waiting = _least_costs(lattice, points, prices, goal)
+    visits = -(-(steps > 0).sum(axis=1)[:layers] // servos)
+    if (layers + 1) * np.prod(visits + 1) * node.size > MOST_VALUES:
+        visits, prices = 0 * visits, prices._replace(switch=0.0)
+    value = _cheapest(node, waiting, prices.switch, visits, 1 if in_actions else servos)
+    strides = np.cumprod(np.append(1, value.shape[:0:-1]))[::-1]
+    layer_of_stop = lattice.reach.reshape(len(lattice.reach), robot.n_segments, -1)
+    # From a layer that the grid leaves out, or an unknown one, every layer has to be entered.
+    place = np.minimum(np.argmax(layer_of_stop.any(axis=-1), axis=-1), layers)
+    return pattern_arrays(
+        lattice,
+        value.reshape(-1),
+        np.append(place, layers) * strides[0],
+        np.zeros(len(place) + 1, dtype=np.int64),
+        [[c * stride for (_, c), stride in zip(points, strides[1 + layers :], strict=True)]],
+        visits=visits,
+        visit=strides[1 : 1 + layers],
+    )
 
-    def __init__(
-        self,
-        lattice: Lattice,
-        prices: Prices,
-        goal: Float[np.ndarray, " S"],
-        *,
-        in_actions: bool,
-    ) -> None:
-        robot, j = lattice.robot, lattice.robot.tendons_per_segment
-        self._lattice, self._in_actions = lattice, in_actions
-        self._servos = int(lattice.reach.sum(axis=1).max())
-        steps = lattice.steps.reshape(robot.n_segments, j)
-        self.layers = min(robot.n_segments, 3)
-        few = np.prod(steps + 1.0, axis=1).max() <= MOST_STATES
-        if not (lattice.one_layer_a_step and few):
-            self.layers = 0
-            return
-        points = [self._points(layer) for layer in range(self.layers)]
-        if not (runs_straight(robot) or pairs_fit(points)):
-            self.layers = 0
-            return
-        node, waiting = _least_costs(lattice, points, prices, goal)
-        visits = -(-(steps > 0).sum(axis=1)[: self.layers] // self._servos)
-        if (self.layers + 1) * np.prod(visits + 1) * node.size > MOST_VALUES:
-            visits, prices = 0 * visits, prices._replace(switch=0.0)
-        most = 1 if in_actions else self._servos
-        self._value = _cheapest(node, waiting, prices.switch, visits, most)
 
-    def __call__(
-        self,
-        remaining: Int[np.ndarray, "N SJ"],
-        stop: Int[np.ndarray, " N"],
-        visits: Int[np.ndarray, "N S"],
-    ) -> Float[np.ndarray, " N"]:
-        """Bound at states, in which so many visits of each layer are counted already."""
-        if not self.layers:
-            return np.zeros(len(remaining))
-        robot = self._lattice.robot
-        left = remaining.reshape(len(remaining), robot.n_segments, -1)
-        steps = self._lattice.steps.reshape(robot.n_segments, -1)
-        classes = [self._class(left[:, i], steps[i]) for i in range(self.layers)]
-        layer_of_stop = self._lattice.reach.reshape(len(self._lattice.reach), robot.n_segments, -1)
-        place = np.argmax(layer_of_stop.any(axis=-1), axis=-1)[stop]
-        # From a layer that the grid leaves out, or an unknown one, every layer has to be entered.
-        place = np.where((stop < 0) | (place >= self.layers), self.layers, place)
-        most = np.array(self._value.shape[1 : 1 + self.layers]) - 1
-        counted = np.minimum(visits[:, : self.layers], most)
-        return np.asarray(self._value[(place, *counted.T, *classes)])
-
-    def _class(
-        self, left: Int[np.ndarray, "N J"], steps: Int[np.ndarray, " J"]
-    ) -> Int[np.ndarray, " N"]:
-        needed, most = self._needed(left), int(self._needed(steps[None])[0])
-        return np.where((left == steps).all(axis=-1) & (most > 0), most + 1, needed)
-
-    def _needed(self, left: Int[np.ndarray, "N J"]) -> Int[np.ndarray, " N"]:
-        """Steps that finish a layer, or fewest actions: a tendon's own, and all by the servos."""
-        if self._lattice.problem.action_set in ("multistep", "splits"):
-            left = np.minimum(left, 1)  # one action may finish a tendon
-        if not self._in_actions:
-            return np.asarray(left.sum(axis=-1))
-        return np.maximum(left.max(axis=-1), -(-left.sum(axis=-1) // self._servos))
-
-    def _points(self, layer: int) -> Points:
-        lattice, j = self._lattice, self._lattice.robot.tendons_per_segment
-        columns = slice(layer * j, (layer + 1) * j)
-        steps = lattice.steps[columns]
-        left = np.indices([int(n) + 1 for n in steps]).reshape(j, -1).T
-        remaining = np.zeros((len(left), lattice.robot.n_tendons), dtype=np.int64)
-        remaining[:, columns] = left
-        return lattice.displacements(remaining)[:, columns], self._class(left, steps)
+def _points(lattice: Lattice, layer: int, servos: int, in_actions: bool) -> Points:
+    """Displacements [m] and class of every state of a layer, in the order of its steps to go."""
+    j = lattice.robot.tendons_per_segment
+    columns = slice(layer * j, (layer + 1) * j)
+    steps = lattice.steps[columns]
+    left = np.indices([int(n) + 1 for n in steps]).reshape(j, -1).T
+    remaining = np.zeros((len(left), lattice.robot.n_tendons), dtype=np.int64)
+    remaining[:, columns] = left
+    needed = left
+    if lattice.problem.action_set in ("multistep", "splits"):
+        needed = np.minimum(left, 1)  # one action may finish a tendon
+    total = needed.sum(axis=-1)
+    # Steps that finish the layer, or fewest actions: a tendon's own, and all by the servos.
+    classes = np.maximum(needed.max(axis=-1), -(-total // servos)) if in_actions else total
+    untouched = (left == steps).all(axis=-1) & (classes[-1] > 0)
+    classes = np.where(untouched, classes[-1] + 1, classes)
+    return lattice.displacements(remaining)[:, columns], classes
 
 
 def _least_costs(

@@ -21,7 +21,8 @@ import numpy as np
 from jaxtyping import Float
 from scipy.linalg import block_diag
 
-from muxjax.planning.arrays import BoundArrays, LatticeArrays, bound_arrays, lattice_arrays
+from muxjax.planning.arrays import BoundArrays, LatticeArrays, lattice_arrays
+from muxjax.planning.bounds import bound_of
 from muxjax.planning.lattice import Lattice
 from muxjax.planning.motion import angles_at, bending_angles
 from muxjax.planning.problem import ACTION_SETS, PlanningError, Problem
@@ -115,7 +116,7 @@ def features(
     b = bending_from_displacements(robot, states.displacements)
     goal = bending_from_displacements(robot, lattice.target)
     theta, theta_goal = jnp.linalg.norm(b, axis=-1), jnp.linalg.norm(goal, axis=-1)
-    needs = context.bound.needs(lattice, states.remaining, states.stop)
+    needs = context.bound.needs(lattice, states.remaining, states.stop, jnp)
     left = jnp.stack(needs.way, axis=-1)
     gone = jnp.where(context.way > 0, 1.0 - left / jnp.maximum(context.way, 1e-12), 1.0)
     same = jnp.concatenate(
@@ -180,7 +181,7 @@ def context_of(lattice: Lattice) -> Context:
     scale = max(float(typical.sum()), 1e-12)
     return Context(
         lattice=lattice_arrays(lattice),
-        bound=bound_arrays(lattice, "count"),
+        bound=bound_of(lattice).arrays("count"),
         scale=np.asarray(scale),
         way=ways.sum(axis=1),
         objective=typical / scale,

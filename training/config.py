@@ -17,7 +17,8 @@ class TrainingConfig(Strict):
 
     Attributes:
         robot: Name of a shipped robot, or path of a YAML file.
-        seed: Of the data, the initial network and the order of batches.
+        seed: Of the initial network, the order of batches and the self-play.
+        data_seed: Of the problems that are labelled once; trainings may share them.
         regimes: Problems that are labelled once.
         self_play: Problems that are labelled anew in each round, by the beam in the order of the
             network as it is then (approximate value iteration).
@@ -38,6 +39,7 @@ class TrainingConfig(Strict):
     file_schema: Literal["muxjax/training/1"] = Field(alias="schema")
     robot: str
     seed: Annotated[int, Field(ge=0)] = 0
+    data_seed: Annotated[int, Field(ge=0)] = 0
     regimes: tuple[Regime, ...]
     self_play: tuple[Regime, ...] = ()
     rounds: Annotated[int, Field(ge=0)] = 0

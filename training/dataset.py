@@ -102,8 +102,11 @@ def searched_decisions(
     lattice: Lattice, width: int, net: ValueNet | None, rng: np.random.Generator
 ) -> Iterator[tuple[Choices, np.ndarray]]:
     """Actions along the best plan of a beam: its own with what is left of its cost, and others."""
-    value = None if net is None else learned_value(lattice, net)
-    found = beamstep(lattice, width=width, value_fn=value)
+    if net is None:
+        found = beamstep(lattice, width=width)
+    else:  # the network stands in for pattern databases, which take longer to build than to search
+        value = learned_value(lattice, net)
+        found = beamstep(lattice, width=width, heuristic="count", value_fn=value)
     if found.status == "failed":
         return
     left = lattice.remaining(found.displacements)

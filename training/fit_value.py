@@ -96,7 +96,7 @@ def fit(config: TrainingConfig, out: Path, data: Path | None = None) -> ValueNet
     robot = muxjax.load_robot(config.robot)
     began = time.monotonic()
     data = data or out / "data"
-    make_shards(data, config.robot, config.regimes, seed=config.seed, width=config.width)
+    make_shards(data, config.robot, config.regimes, seed=config.data_seed, width=config.width)
     trainer = _Trainer(config, robot, out)
     progress = trainer.restored()
     folders = [data]

@@ -18,6 +18,7 @@ from muxjax.collision import (
     world_from_config,
 )
 from muxjax.ik import IkStatus, all_ik, solve_ik
+from muxjax.robot import load_robot
 
 COMPILED = jax.jit(clearance)
 
@@ -70,11 +71,17 @@ def test_the_place_of_the_collision_is_on_the_arm(muxarm):
     assert result.clearance == pytest.approx(depth, abs=6e-3)
 
 
-@pytest.mark.parametrize("weights", [None, (1.0, 1.0, 1.0, 1.0, 1.0, 0.0)])
-def test_freedom_is_used_to_go_around(robot, rng, weights):
+@pytest.mark.parametrize(
+    ("name", "weights"),
+    [
+        ("muxarm", (1.0, 1.0, 1.0, 1.0, 1.0, 0.0)),
+        pytest.param("penta", (1.0, 1.0, 1.0, 1.0, 1.0, 0.0), marks=pytest.mark.slow),
+        pytest.param("penta", None, marks=pytest.mark.slow),
+    ],
+)
+def test_freedom_is_used_to_go_around(name, rng, weights):
     """A ball is put where the nearest solution has its second segment; goals leave freedom."""
-    if weights is None and robot.n_segments == 3:
-        return
+    robot = load_robot(name)
     q = random_configurations(robot, rng, 6)
     q[:, 0::2] *= 0.5
     pose = np.array([independent.pose(robot, row) for row in q])

@@ -85,6 +85,39 @@ def test_the_compiled_table_shows_terms_the_same_transitions(muxarm, rng):
     assert first == pytest.approx(second, abs=1e-10)
 
 
+@pytest.mark.parametrize(
+    ("action_set", "max_step", "axial"),
+    [("subsets", 0.03, None), ("all", 0.02, 4), ("multistep", 0.03, None), ("splits", None, 7)],
+)
+def test_a_table_of_promising_states_has_the_same_optima(
+    muxarm, rng, monkeypatch, action_set, max_step, axial
+):
+    monkeypatch.setattr("muxjax.planning.table._SOON_SOLVED", 0)
+    for servos, preset in [((1, 3), "paper"), ((1, 2, 3), "no-overshoot")]:
+        start, target = random_targets(muxarm, rng, 2)
+        problem = Problem(
+            0.2 * start,
+            target,
+            servos=servos,
+            preset=preset,
+            max_step=max_step,
+            axial=axial,
+            action_set=action_set,
+        )
+        lattice = Lattice(muxarm, problem)
+        whole, some = (LatticeTable(lattice, 2**30, whole=kind) for kind in (True, False))
+        assert some.expansions < whole.expansions
+        assert (some.value >= whole.value * (1 - 1e-12)).all()
+        remaining, stop, first = lattice.steps, lattice.start_stop, True
+        while remaining.any():
+            choices, ours = (t.choices(remaining, stop, first=first) for t in (whole, some))
+            through = choices.cost + choices.to_go
+            optimal = through <= through.min() + 1e-10
+            assert ours.to_go[optimal] == pytest.approx(choices.to_go[optimal], rel=1e-12)
+            best, first = int(np.argmax(optimal)), False
+            remaining, stop = remaining - choices.moves[best], int(choices.stop[best])
+
+
 def test_a_batch_is_its_plans(muxarm, rng):
     targets = random_targets(muxarm, rng, 19)
     for servos, axial in [((1, 3), None), ((1, 2, 3), 5)]:

@@ -10,7 +10,7 @@ import pytest
 import muxjax
 from muxjax.config import load_yaml, resolve
 from muxjax.metrics.protocol import Protocol
-from muxjax.metrics.report import csv_text, markdown
+from muxjax.metrics.report import cell, csv_text, markdown
 from muxjax.metrics.statistics import dominated_by, median_interval, paired_difference, spread
 from muxjax.metrics.table2 import run_table, summarise
 
@@ -129,6 +129,7 @@ def test_reports_hold_every_setting_and_note(small, records):
     for wanted in (*(s.name for s in small.settings), *small.notes, "Greedy, published"):
         assert wanted in text
     assert "| Reversed, published | 81.3 (20.8) |  | 7.0 (1.0) |" in text  # printed 8.0
+    assert cell((-1e-15, 0.04)) == "0.0 (0.0)"
     lines = csv_text(table).splitlines()
     assert len(lines) == 1 + len(table.rows)
     assert len({line.count(",") - line.count(", ") for line in lines}) == 1

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 import signal
 import socket
 import subprocess
@@ -365,6 +366,12 @@ workspace.sweep(muxjax.load_robot("muxarm"), samples=int(sys.argv[1]), seed=11, 
 PLENTY = 1 << 30  # far more than a run gets to before it is stopped
 
 
+@pytest.fixture(scope="module")
+def killed(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, int]:
+    """Of random samples; who goes on from its checkpoint takes a copy."""
+    return stopped_run(tmp_path_factory.mktemp("killed"), "random", signal.SIGKILL)
+
+
 def stopped_run(tmp_path: Path, sampler: str, number: int) -> tuple[Path, int]:
     """Checkpoint of a real process that got the signal in the middle of its work."""
     checkpoint = tmp_path / "sweep.ckpt"
@@ -391,13 +398,24 @@ def stopped_run(tmp_path: Path, sampler: str, number: int) -> tuple[Path, int]:
     return checkpoint, process.returncode
 
 
-@pytest.mark.parametrize(
-    ("number", "sampler"), [(signal.SIGKILL, "random"), (signal.SIGINT, "lattice")]
-)
 def test_killed_and_resumed_is_bit_identical(
+    muxarm: Robot, tmp_path: Path, killed: tuple[Path, int]
+) -> None:
+    stopped, code = killed
+    goes_on_bit_identically(muxarm, shutil.copy(stopped, tmp_path / "sweep.ckpt"), code, "random")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGINT])
+@pytest.mark.parametrize("sampler", ["random", "lattice"])
+def test_stopped_and_resumed_is_bit_identical(
     muxarm: Robot, tmp_path: Path, number: signal.Signals, sampler: str
 ) -> None:
-    checkpoint, code = stopped_run(tmp_path, sampler, number)
+    goes_on_bit_identically(muxarm, *stopped_run(tmp_path, sampler, number), sampler)
+
+
+def goes_on_bit_identically(muxarm: Robot, checkpoint: Path, code: int, sampler: str) -> None:
+    """A sweep that goes on from the checkpoint of a stopped one, against one in a piece."""
     assert code != 0
     with np.load(checkpoint) as stored:
         done = int(stored["counts"].sum())
@@ -408,8 +426,10 @@ def test_killed_and_resumed_is_bit_identical(
     assert same(resumed, workspace.sweep(muxarm, **options))
 
 
-def test_checkpoint_of_another_sweep_is_refused(muxarm: Robot, tmp_path: Path) -> None:
-    checkpoint, _ = stopped_run(tmp_path, "random", signal.SIGINT)
+def test_checkpoint_of_another_sweep_is_refused(
+    muxarm: Robot, tmp_path: Path, killed: tuple[Path, int]
+) -> None:
+    checkpoint = shutil.copy(killed[0], tmp_path / "sweep.ckpt")
     options: dict = {"checkpoint": checkpoint, "resume": True, "samples": PLENTY, **SMALL}
     with pytest.raises(workspace.SweepFileError, match=r"sweep\.ckpt: is of another sweep"):
         workspace.sweep(muxarm, seed=12, **options)
@@ -431,7 +451,7 @@ assert jax.process_count() == 2 and found.counts.sum() == 2300000
 """
 
 
-@pytest.mark.parametrize("sampler", ["random", "lattice"])
+@pytest.mark.parametrize("sampler", [pytest.param("random", marks=pytest.mark.slow), "lattice"])
 def test_two_processes_give_the_table_of_one(muxarm: Robot, tmp_path: Path, sampler: str) -> None:
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))

@@ -30,7 +30,7 @@ import muxjax
 from muxjax.config import Strict, load_yaml
 from muxjax.metrics.statistics import median_interval, spread
 from muxjax.planning import METHODS, Plan, PlanningError, Problem
-from muxjax.planning.beamstep import Beam
+from muxjax.planning.beam import Beam
 from muxjax.planning.checkpoint import load_value
 from muxjax.planning.exact import exact
 from muxjax.planning.lattice import Lattice

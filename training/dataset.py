@@ -79,7 +79,7 @@ def exact_decisions(
     lattice: Lattice, count: int, rng: np.random.Generator
 ) -> Iterator[tuple[Choices, np.ndarray]]:
     """Actions of states on walks that mostly follow the optimum; their cost to go is exact."""
-    table = solved_table(lattice, DEFAULT_MEMORY)
+    table = solved_table(lattice, DEFAULT_MEMORY, whole=True)
     made = 0
     for _ in range(count):  # walks; one is at least a decision, or there is none to make
         remaining, stop, first = lattice.steps, lattice.start_stop, True

@@ -12,8 +12,8 @@ from muxjax.metrics.table2 import Difference, Row, Table
 
 
 def cell(values: Spread | tuple[float, float], less: float = 0.0) -> str:
-    """Median (IQR), the median less a number."""
-    return f"{values[0] - less + 0.0:.1f} ({values[1]:.1f})"
+    """Median (IQR), the median less a number, without a minus before zero."""
+    return f"{round(values[0] - less, 1) + 0.0:.1f} ({values[1]:.1f})"
 
 
 def interval(values: Interval, digits: int = 1) -> str:

@@ -12,9 +12,9 @@ from collections.abc import Callable
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from muxjax.planning.lattice import Lattice
+from muxjax.planning.lattice import Lattice, Step
 from muxjax.planning.problem import Plan
-from muxjax.planning.replay import Step, replay
+from muxjax.planning.replay import replay
 
 Policy = Callable[[Int[np.ndarray, " SJ"], Float[np.ndarray, " SJ"]], int]
 

@@ -7,30 +7,17 @@ from dataclasses import dataclass, replace
 from itertools import count
 from time import monotonic
 
-import jax
 import numpy as np
 from jaxtyping import Int
 
-from muxjax.planning.arrays import lattice_arrays, level_room
 from muxjax.planning.baselines import greedy, reverse, sequential
-from muxjax.planning.bounds import bound_of
-from muxjax.planning.lattice import Lattice
-from muxjax.planning.problem import Plan, PlanningError
-from muxjax.planning.replay import Step, failed, replay
-from muxjax.planning.search import Found, ValueFunction, search
-from muxjax.planning.terms import traced
+from muxjax.planning.beam import WIDEST, Beam
+from muxjax.planning.lattice import Lattice, Step
+from muxjax.planning.problem import Plan
+from muxjax.planning.replay import failed, replay
+from muxjax.planning.search import ValueFunction
 
 HEURISTICS = ("patterns", "count", "none")
-_ROOMS = (
-    1,
-    16,
-    64,
-    256,
-    1024,
-    4096,
-    16384,
-    65536,
-)  # for the plans of a level: one compilation each
 
 
 def beamstep(
@@ -77,7 +64,7 @@ def beamstep(
         expansions += int(found.expansions)
         tight = proved >= cost or (gap is not None and cost - proved <= gap * cost)
         late = deadline_s is not None and monotonic() - began >= deadline_s
-        if tight or late or (gap is None and deadline_s is None) or 2 * width > _ROOMS[-1]:
+        if tight or late or (gap is None and deadline_s is None) or 2 * width > WIDEST:
             break
         width *= 2
     if not np.isfinite(cost):
@@ -101,8 +88,8 @@ def beamstep(
 
 
 def _check_options(width: int, heuristic: str, gap: float | None, deadline_s: float | None) -> None:
-    if not isinstance(width, int) or not 1 <= width <= _ROOMS[-1]:
-        raise ValueError(f"width: must be a whole number from 1 to {_ROOMS[-1]}, found {width!r}")
+    if not isinstance(width, int) or not 1 <= width <= WIDEST:
+        raise ValueError(f"width: must be a whole number from 1 to {WIDEST}, found {width!r}")
     if heuristic not in HEURISTICS:
         raise ValueError(f"heuristic: must be one of {', '.join(HEURISTICS)}, found {heuristic!r}")
     for name, value in (("gap", gap), ("deadline_s", deadline_s)):
@@ -119,65 +106,6 @@ def _none_found(lattice: Lattice, width: int, proved: float, expansions: int) ->
         else f"no plan found at width {width}, where others were cut off; take a larger one"
     )
     return failed(lattice, method="beamstep", reason=reason, expansions=expansions)
-
-
-class Beam:
-    """The compiled search of one lattice, for any width and any plan to better.
-
-    Args:
-        lattice: The problem on the robot.
-        heuristic: As in ``beamstep``.
-        value_fn: As in ``beamstep``.
-    """
-
-    def __init__(
-        self, lattice: Lattice, heuristic: str = "patterns", value_fn: ValueFunction | None = None
-    ) -> None:
-        self.lattice = lattice
-        self._terms = (
-            *lattice.problem.compiled_terms(expensive=False),
-            *lattice.problem.compiled_terms(expensive=True),
-        )
-        self._value = None if value_fn is None else traced(value_fn)
-        with jax.enable_x64(True):
-            self._arrays = jax.device_put(
-                (lattice_arrays(lattice), bound_of(lattice).arrays(heuristic))
-            )
-
-    def search(self, width: int, best: float = np.inf) -> Found:
-        """The best plan of at most ``width`` a level, if it costs less than ``best``.
-
-        Raises:
-            PlanningError: A cost term is negative.
-        """
-        with jax.enable_x64(True):
-            found = search(
-                self.lattice.robot,
-                *self._terms,
-                *self._arrays,
-                self._value,
-                np.int32(width),
-                np.float64(best),
-                rows=next(room for room in _ROOMS if room >= width),
-                levels=level_room(self.lattice),
-            )
-            found = jax.device_get(found)
-        if found.negative:
-            raise PlanningError("a cost term is negative; terms must be at least 0")
-        return found
-
-    def steps(self, found: Found) -> list[Step]:
-        """The steps of the plan that was found."""
-        actions, row = [int(found.action)], int(found.parent)
-        for level in reversed(range(int(found.length) - 1)):
-            actions.append(int(found.actions[level, row]))
-            row = int(found.parents[level, row])
-        stops, counts = self.lattice.actions
-        remaining, steps = self.lattice.steps, list[Step]()
-        for action in reversed(actions):
-            steps.append(Step(int(stops[action]), np.minimum(counts[action], remaining)))
-            remaining = remaining - steps[-1].moves
-        return steps
 
 
 @dataclass(frozen=True)

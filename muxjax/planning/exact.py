@@ -15,14 +15,15 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from muxjax.planning.beamstep import beamstep
-from muxjax.planning.lattice import Lattice
+from muxjax.planning.lattice import Lattice, Step
 from muxjax.planning.problem import Plan
-from muxjax.planning.replay import Step, failed, replay
+from muxjax.planning.replay import failed, replay
 from muxjax.planning.table import Table, TableTooLargeError, solved_table
 
 DEFAULT_MEMORY = 2 * 2**30  # [bytes]
 _CHECKED_AT_ONCE = 64  # steps about which an expensive term is asked in one call
 _DECIMALS = 10  # costs that differ by less count as equal, and the plan nearer its end goes first
+_EQUAL = 10.0**-_DECIMALS
 
 
 def exact(
@@ -42,7 +43,8 @@ def exact(
             cost term is negative, or lower with a repositioning than without.
     """
     try:
-        table = solved_table(lattice, memory_limit)
+        # What expensive terms add may lead off the plans that are cheapest without them.
+        table = solved_table(lattice, memory_limit, whole=lattice.has_expensive_terms)
     except TableTooLargeError as refusal:
         if not fallback:
             raise
@@ -56,12 +58,12 @@ def exact(
 
 
 def _follow(lattice: Lattice, table: Table) -> tuple[list[Step] | None, str]:
-    """The table's minimum from the start."""
+    """The table's minimum from the start; of equals the first, whatever the rounding."""
     remaining, stop, steps = lattice.steps, lattice.start_stop, list[Step]()
     while remaining.any():
         choices = table.choices(remaining, stop, first=not steps)
         through = choices.cost + choices.to_go
-        best = int(np.argmin(through))
+        best = int(np.argmax(through <= through.min() + _EQUAL))
         if not np.isfinite(through[best]):
             return None, "every order passes through a state that is not defined"
         stop = int(choices.stop[best])

@@ -27,6 +27,14 @@ _LARGEST_BATCH = 16384
 _EXPENSIVE_BATCH = 64  # always this many: such terms take long to compile
 
 
+@dataclass(frozen=True)
+class Step:
+    """One chosen action: the stop, and the steps that each tendon moves there."""
+
+    stop: int
+    moves: Int[np.ndarray, " SJ"]
+
+
 @dataclass(frozen=True, eq=False)
 class Lattice:
     """The lattice of one problem on one robot. Host side; arrays count from 0.

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
@@ -10,19 +9,11 @@ from jaxtyping import Bool, Float, Int
 
 from muxjax.planning.axial import fewest_repositionings
 from muxjax.planning.bounds import bound_of
-from muxjax.planning.lattice import Lattice
+from muxjax.planning.lattice import Lattice, Step
 from muxjax.planning.problem import Plan
 from muxjax.planning.table import FullMoveTable
 
 _ROUNDING = 1e-12  # relative, between the sums of two plans of equal cost
-
-
-@dataclass(frozen=True)
-class Step:
-    """One chosen action: the stop, and the steps that each tendon moves there."""
-
-    stop: int
-    moves: Int[np.ndarray, " SJ"]
 
 
 def replay(

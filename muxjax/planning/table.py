@@ -14,6 +14,8 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from muxjax.planning import full_moves
+from muxjax.planning.beam import Beam
+from muxjax.planning.bounds import bound_of
 from muxjax.planning.lattice import Lattice
 from muxjax.planning.problem import PlanningError
 
@@ -22,6 +24,10 @@ _BYTES_PER_STATE = 24
 # A possible step of a state while its chunk is worked on: masks and states, by tendon.
 _BYTES_PER_STEP_AND_TENDON = 48
 _CHUNK_BYTES = 64 * 2**20
+# States times actions of a table that is solved before the beam has an answer.
+_SOON_SOLVED = 2**15
+_WIDTH = 64  # of the beam whose plan bounds what is solved
+_ROUNDING = 1e-9  # relative; costs that differ by less may be the same
 
 
 class TableTooLargeError(PlanningError):
@@ -43,12 +49,18 @@ class LatticeTable:
     With V[s, p] the cost to go from state s at stop p,
     V[s, p] = min over actions (k, moves) of cost(s, moves, p != k) + V[s - moves, k].
 
+    Args:
+        lattice: The problem on the robot.
+        memory_limit: Most memory that the table may take [bytes].
+        whole: False leaves out, at infinity, states through which no plan as cheap as the layered
+            beam's can go: those on the cheapest plans from the start keep their cost to go.
+
     Raises:
         PlanningError: The table does not fit, and the message says how large it would be; or a
             cost term is negative, or lower with a repositioning than without.
     """
 
-    def __init__(self, lattice: Lattice, memory_limit: int) -> None:
+    def __init__(self, lattice: Lattice, memory_limit: int, *, whole: bool = True) -> None:
         self.lattice = lattice
         self.shape = lattice.steps + 1
         states, stops = math.prod(int(n) for n in self.shape), len(lattice.reach)
@@ -65,32 +77,69 @@ class LatticeTable:
         self.strides = np.concatenate([np.cumprod(self.shape[::-1])[::-1][1:], [1]])
         self.value = np.full((states, stops), np.inf)
         self.expansions = 0
-        self._fill()
+        layers = self._layers()
+        whole = whole or states * actions <= _SOON_SOLVED
+        self._fill(layers if whole else self._promising(layers))
 
     def remaining(self, index: Int[np.ndarray, " N"]) -> Int[np.ndarray, "N SJ"]:
         """Mixed-radix digits of flat indices."""
         return index[:, None] // self.strides % self.shape
 
-    def _fill(self) -> None:
-        """Solve all states, those with fewer steps to go first."""
+    def _layers(self) -> list[Int[np.ndarray, " _"]]:
+        """All states by their steps to go."""
         to_go = np.zeros(1, dtype=np.int32)
         for n in self.shape:
             to_go = (to_go[:, None] + np.arange(n, dtype=np.int32)).reshape(-1)
         order = np.argsort(to_go, kind="stable")
-        layers = np.split(order, np.cumsum(np.bincount(to_go))[:-1])
-        self.value[layers[0]] = 0.0
+        return np.split(order, np.cumsum(np.bincount(to_go))[:-1])
+
+    def _promising(self, layers: list[Int[np.ndarray, " _"]]) -> list[Int[np.ndarray, " _"]]:
+        """Of each layer, the states whose cost from the start and bound leave a plan some hope."""
+        lattice = self.lattice
+        most = float(Beam(lattice).search(_WIDTH).cost) * (1 + _ROUNDING)
+        from_start = self.value  # its memory, until the table is filled
+        at, moves, cost, _ = self.choices(lattice.steps, lattice.start_stop, first=True)
+        np.minimum.at(from_start, ((lattice.steps - moves) @ self.strides, at), cost)
+        kept = [layers[-1]]
+        for layer in layers[-2::-1]:
+            reached = layer[np.isfinite(from_start[layer]).any(axis=1)]
+            chunks = [reached[:0]]
+            for i in range(0, len(reached), self.chunk):
+                chunks.append(self._pass_on(reached[i : i + self.chunk], most))
+            kept.append(np.concatenate(chunks))
+        from_start.fill(np.inf)
+        return kept[::-1]
+
+    def _pass_on(self, index: Int[np.ndarray, " N"], most: float) -> Int[np.ndarray, " M"]:
+        """States of these with some hope; the cost from the start of those after them improves."""
+        state, stop = np.nonzero(np.isfinite(self.value[index]))
+        bound = bound_of(self.lattice)(self.remaining(index[state]), stop)
+        hopeful = self.value[index[state], stop] + bound <= most
+        kept, row = np.unique(state[hopeful], return_inverse=True)
+        index = index[kept]
+        from_start = np.full((len(index), self.value.shape[1]), np.inf)
+        from_start[row, stop[hopeful]] = self.value[index[row], stop[hopeful]]
+        state, action, costs, after = self._steps(self.remaining(index), first=False)
+        at = self.lattice.actions[0][action]
+        there = from_start[state, at] + costs[:, 0]
+        moved = from_start.min(axis=1)[state] + costs[:, 1]
+        np.minimum.at(self.value, (after, at), np.minimum(there, moved))
+        return index
+
+    def _fill(self, layers: list[Int[np.ndarray, " _"]]) -> None:
+        """Solve the states, those with fewer steps to go first."""
+        self.value[0] = 0.0
         for layer in layers[1:]:
             for i in range(0, len(layer), self.chunk):
                 self._solve(layer[i : i + self.chunk])
 
     def _solve(self, index: Int[np.ndarray, " N"]) -> None:
         stops, counts = self.lattice.actions
-        remaining = self.remaining(index)
-        state, action, costs, to_go = self._steps(remaining, first=False)
+        state, action, costs, after = self._steps(self.remaining(index), first=False)
         if (costs[:, 1] < costs[:, 0]).any():
             raise PlanningError("exact: a cost term pays for repositioning, which has no optimum")
         through = np.full((2, len(index), len(counts)), np.inf)
-        through[:, state, action] = costs.T + to_go
+        through[:, state, action] = costs.T + self.value[after, stops[action]]
         elsewhere = through[1].min(axis=1, keepdims=True)
         # Actions of one stop stand next to each other.
         bounds = np.flatnonzero(np.diff(stops, prepend=-1))
@@ -104,26 +153,25 @@ class LatticeTable:
         Int[np.ndarray, " E"],
         Int[np.ndarray, " E"],
         Float[np.ndarray, "E 2"],
-        Float[np.ndarray, " E"],
+        Int[np.ndarray, " E"],
     ]:
-        """State and action of every possible step, its two costs, and the value after it."""
-        stops, _ = self.lattice.actions
+        """State and action of every possible step, its two costs, and the state after it."""
         possible, moves = self.lattice.expand(remaining)
         state, action = np.nonzero(possible)
         moved = moves[state, action]
         after = (remaining[state] - moved) @ self.strides
         costs = self.lattice.costs(remaining[state], moved, first=first)
-        return state, action, costs, self.value[after, stops[action]]
+        return state, action, costs, after
 
     def choices(
         self, remaining: Int[np.ndarray, " SJ"], stop: int, *, first: bool = False
     ) -> Choices:
         """Steps from a state at a stop (-1: not known); ``first`` if it is the start."""
         stops, counts = self.lattice.actions
-        _, action, costs, to_go = self._steps(remaining[None], first=first)
+        _, action, costs, after = self._steps(remaining[None], first=first)
         at = stops[action]
         cost = np.where(at == stop, costs[:, 0], costs[:, 1])
-        return Choices(at, np.minimum(counts[action], remaining), cost, to_go)
+        return Choices(at, np.minimum(counts[action], remaining), cost, self.value[after, at])
 
 
 class FullMoveTable:
@@ -196,8 +244,8 @@ class FullMoveTable:
 Table = LatticeTable | FullMoveTable
 
 
-def solved_table(lattice: Lattice, memory_limit: int) -> Table:
-    """The compiled table where it fits, else the one on the host.
+def solved_table(lattice: Lattice, memory_limit: int, *, whole: bool) -> Table:
+    """The compiled table where it fits, else the one on the host (``whole``: see there).
 
     Raises:
         PlanningError: See the tables.
@@ -206,4 +254,4 @@ def solved_table(lattice: Lattice, memory_limit: int) -> Table:
         table = FullMoveTable(lattice)
         table.check()
         return table
-    return LatticeTable(lattice, memory_limit)
+    return LatticeTable(lattice, memory_limit, whole=whole)

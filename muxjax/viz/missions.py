@@ -27,6 +27,8 @@ _PANELS_A_ROW = 4
 _WALL, _BALL, _GRIPPER = "0.62", "#E69F00", "0.25"
 _KINDS = {"tendons": "#0072B2", "base": "#D55E00", "grasp": _BALL, "release": _BALL}
 _FAR = 10.0  # [m]; what is further away is not drawn
+_LETTER = 0.09  # of a step's name [inch]
+_NAME_HEIGHT = 0.17  # of a step's name [inch], with the room to the next one
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,20 +80,23 @@ def draw_mission(
     bands = -(-len(snapshots) // columns)
     rows = bands * len(views)
     heights = [2.5 * _tallness(_limits(snapshots, view)) + 0.8 for view in views] * bands
-    figure = Figure(figsize=(3.0 * columns, sum(heights) + 2.4), layout="constrained")
+    below = 1.8 + _LETTER * max(len(bar.step) for bar in bars)
+    figure = Figure(figsize=(3.0 * columns, sum(heights) + below + 0.5), layout="constrained")
     figure.suptitle(title)
-    grid = figure.add_gridspec(rows + 1, columns, height_ratios=[*heights, 2.0])
+    parts = figure.subfigures(2, 1, squeeze=False, height_ratios=[sum(heights), below])
+    panels, strip = parts[:, 0]
+    grid = panels.add_gridspec(rows, columns, height_ratios=heights)
     for number, snapshot in enumerate(snapshots):
         band, column = divmod(number, columns)
         for k, view in enumerate(views):
-            axes = figure.add_subplot(grid[band * len(views) + k, column])
+            axes = panels.add_subplot(grid[band * len(views) + k, column])
             _draw_view(axes, snapshot, view, _limits(snapshots, view))
             axes.tick_params(labelsize=7)
             axes.set_ylabel(f"{'xyz'[view[1]]} [mm]" if column == 0 else "", fontsize=8)
             axes.set_xlabel(f"{'xyz'[view[0]]} [mm]", fontsize=8)
             if k == 0:
                 axes.set_title(snapshot.title, fontsize=9)
-    _draw_bars(figure.add_subplot(grid[rows, :]), bars, margin)
+    _draw_bars(strip.add_subplot(), bars, margin)
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, dpi=100)
@@ -244,12 +249,54 @@ def _draw_bars(axes: Any, bars: Sequence[Bar], margin: float) -> None:
     axes.set_ylabel("least clearance [mm]", fontsize=8)
     axes.set_xlim(-0.6, len(bars) - 0.4)
     axes.tick_params(labelsize=7)
-    starts = [k for k, bar in enumerate(bars) if k == 0 or bars[k - 1].step != bar.step]
-    axes.set_xticks(starts, [bars[k].step for k in starts], rotation=25, ha="right", fontsize=8)
+    _name_steps(axes, bars)
     shown = {kind: shade for kind, shade in _KINDS.items() if any(b.kind == kind for b in bars)}
     marks = [mpl.patches.Patch(color=shade) for shade in shown.values()]
     line = mpl.lines.Line2D([], [], color="0.2", lw=0.9, ls="--")
     axes.legend(
-        [*marks, line], [f"{kind} stage" for kind in shown] + ["margin"], fontsize=7, ncols=5
+        [*marks, line],
+        [f"{kind} stage" for kind in shown] + ["margin"],
+        loc="lower center",
+        bbox_to_anchor=(0.5, 1.0),
+        frameon=False,
+        fontsize=7,
+        ncols=5,
     )
     axes.grid(axis="y", alpha=0.3)
+
+
+def _name_steps(axes: Any, bars: Sequence[Bar]) -> None:
+    """Below the bars, a bracket around the stages of each step, and upright its name."""
+    starts = [k for k, bar in enumerate(bars) if k == 0 or bars[k - 1].step != bar.step]
+    ends = [k - 1 for k in [*starts[1:], len(bars)]]
+    middles = [(first + last) / 2 for first, last in zip(starts, ends, strict=True)]
+    bars_an_inch = len(bars) / (0.9 * axes.figure.bbox.width / axes.figure.dpi)
+    places = _apart(middles, _NAME_HEIGHT * bars_an_inch, len(bars) - 1.0)
+    axes.set_xticks([])
+    below = axes.get_xaxis_transform()
+    line = {"color": "0.3", "lw": 0.9, "clip_on": False, "transform": below}
+    for first, last, middle, place in zip(starts, ends, middles, places, strict=True):
+        axes.plot([first - 0.35, last + 0.35], [-0.03, -0.03], **line)
+        axes.plot([middle, place], [-0.03, -0.08], **line)
+        axes.text(
+            place,
+            -0.1,
+            bars[first].step,
+            rotation=90,
+            ha="center",
+            va="top",
+            fontsize=8,
+            transform=below,
+        )
+
+
+def _apart(wanted: Sequence[float], gap: float, last: float) -> list[float]:
+    """Rising places with at least a gap between them, the last one no further than ``last``."""
+    places: list[float] = []
+    for place in wanted:
+        places.append(max(place, places[-1] + gap) if places else place)
+    highest = last
+    for k in reversed(range(len(places))):
+        places[k] = min(places[k], highest)
+        highest = places[k] - gap
+    return places

@@ -42,8 +42,8 @@ _MOST = 3.0  # features beyond are clipped
 class ValueNet(eqx.Module):
     """A perceptron with one output; float32."""
 
-    weights: tuple[Float[Array, "inputs outputs"], ...]
-    biases: tuple[Float[Array, " outputs"], ...]
+    weights: tuple[Float[Array, "_ _"], ...]
+    biases: tuple[Float[Array, " _"], ...]
 
     def __call__(self, features: Float[Array, "N F"]) -> Float[Array, " N"]:
         """Correction in units of the scale, above zero."""

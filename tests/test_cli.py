@@ -267,7 +267,7 @@ def test_a_refusing_planner_does_not_end_the_demo(muxjax, tmp_path):
         "  - {name: bent, position_m: [0.02901, 0.157179, 0.404852],"
         " quaternion_wxyz: [0.97691724, 0.03292573, -0.07370458, 0.19777825]}\n"
     )
-    command = ("demo", "--task", str(task), "--out", str(tmp_path), "--max-step-mm", "3")
+    command = ("demo", "--task", str(task), "--out", str(tmp_path), "--max-step-mm", "1")
     code, text, _ = muxjax(*command, "--methods", "exact", "sequential", "--json")
     outcomes = json.loads(text)
     assert code == 0

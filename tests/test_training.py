@@ -22,7 +22,13 @@ from training.problems import Regime, random_problem
 
 FULL = Regime(name="full", problems=2, decisions=12, bent=0.5, underway=0.5, spread=0.3)
 CONFIG = TrainingConfig(
-    schema="muxjax/training/1", robot="muxarm", regimes=(FULL,), hidden=(8,), epochs=4, batch=8
+    schema="muxjax/training/1",
+    robot="muxarm",
+    regimes=(FULL,),
+    hidden=(8,),
+    epochs=4,
+    batch=8,
+    shard=1,
 )
 
 
@@ -115,10 +121,10 @@ def test_an_interrupted_training_comes_to_the_same_curve(data, tmp_path, monkeyp
 
 
 def test_training_lowers_the_loss(data, tmp_path):
-    config = CONFIG.model_copy(update={"epochs": 30, "patience": 30})
+    config = CONFIG.model_copy(update={"epochs": 60, "patience": 60, "learning_rate": 0.02})
     fit(config, tmp_path, data)
     curve = json.loads((tmp_path / "curve.json").read_text())
-    assert curve[-1]["train"] < 0.8 * curve[0]["train"]
+    assert curve[-1]["train"] < 0.7 * curve[0]["train"]
 
 
 def test_wrong_configurations_name_the_field(tmp_path):

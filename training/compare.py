@@ -267,7 +267,7 @@ def _table(records: list[Record]) -> str:
         ]
         digits = (2, 1, 0, 2, 1, 1, 0, 1)
         cells = [
-            "{:.{d}f} ({:.{d}f})".format(*spread(column), d=d)
+            "{:.{d}f} ({:.{d}f})".format(*spread(np.array(column, float)), d=d)
             for column, d in zip(columns, digits, strict=True)
         ]
         lines.append(f"| {name} | {100 * len(found) / len(rows):.0f} | " + " | ".join(cells) + " |")

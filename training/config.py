@@ -24,6 +24,7 @@ class TrainingConfig(Strict):
             network as it is then (approximate value iteration).
         rounds: Rounds of self-play.
         width: Plans a level of the beam that labels.
+        shard: Problems in a file of the data; the last one of each regime is held back.
         hidden: Sizes of the hidden layers.
         epochs: At most, before and after each round.
         patience: Epochs without a better validation loss after which training ends.
@@ -44,6 +45,7 @@ class TrainingConfig(Strict):
     self_play: tuple[Regime, ...] = ()
     rounds: Annotated[int, Field(ge=0)] = 0
     width: Count = 64
+    shard: Count = 50
     hidden: tuple[Count, ...] = (64, 64)
     epochs: Count = 30
     patience: Count = 8

@@ -96,7 +96,14 @@ def fit(config: TrainingConfig, out: Path, data: Path | None = None) -> ValueNet
     robot = muxjax.load_robot(config.robot)
     began = time.monotonic()
     data = data or out / "data"
-    make_shards(data, config.robot, config.regimes, seed=config.data_seed, width=config.width)
+    make_shards(
+        data,
+        config.robot,
+        config.regimes,
+        seed=config.data_seed,
+        width=config.width,
+        shard=config.shard,
+    )
     trainer = _Trainer(config, robot, out)
     progress = trainer.restored()
     folders = [data]
@@ -106,7 +113,13 @@ def fit(config: TrainingConfig, out: Path, data: Path | None = None) -> ValueNet
         if stage > int(progress.stage):
             net, seed = progress.best, config.seed + 1000 * stage
             make_shards(
-                folders[-1], config.robot, config.self_play, seed=seed, width=config.width, net=net
+                folders[-1],
+                config.robot,
+                config.self_play,
+                seed=seed,
+                width=config.width,
+                net=net,
+                shard=config.shard,
             )
             progress = trainer.next_stage(progress)
         if stage == int(progress.stage):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -47,6 +48,27 @@ def test_import_brings_in_nothing_optional():
 
 def test_the_import_test_can_fail():
     assert "cantools" in imported_with("import muxjax, cantools", OPTIONAL)
+
+
+@pytest.mark.parametrize("core", ["envs.config", "envs.tdma", "envs.lanes"])
+def test_the_core_of_the_environment_brings_in_nothing_optional(core):
+    assert imported_with(f"import {core}", OPTIONAL) == []
+
+
+def test_gymnasium_users_need_no_torch():
+    assert imported_with("import envs.gymnasium_adapter", OPTIONAL) == ["gymnasium"]
+
+
+def test_no_room_beside_the_package_is_pointed_back_at():
+    """Rooms beside the package: envs uses muxjax, training uses both, nothing points back."""
+    root = PACKAGE.parent
+    used = {
+        room: "".join(path.read_text() for path in (root / room).rglob("*.py"))
+        for room in ("muxjax", "envs", "training")
+    }
+    for below, above in (("muxjax", "envs"), ("muxjax", "training"), ("envs", "training")):
+        assert not re.search(rf"^\s*(from|import) {above}\b", used[below], re.MULTILINE)
+    assert "from envs" in used["training"]
 
 
 def test_config_needs_no_jax():

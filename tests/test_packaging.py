@@ -12,6 +12,8 @@ CHECKOUT = Path(__file__).resolve().parent.parent
 
 USE_IT = """
 import muxjax
+from envs.config import load_env_config
+from envs.tdma import Tdma
 from muxjax.config import TaskConfig, load_yaml, resolve
 from muxjax.hardware import load_physics
 from muxjax.hardware.codec import database
@@ -21,6 +23,7 @@ for name in ("muxarm", "penta"):
 print(len(load_yaml(TaskConfig, resolve("fig9a", "tasks")).targets))
 print(muxjax.Problem([0.0], [0.0], preset="paper").cost_weights["travel"], load_physics("ideal"))
 print(len(database().messages))
+print(Tdma(load_env_config("muxarm")).n_actions)
 """
 
 

@@ -28,11 +28,11 @@ import tyro
 from torch.utils.tensorboard import SummaryWriter
 
 import muxjax
-from muxjax.config import ConfigError, load_yaml
+from muxjax.config import load_yaml
 from muxjax.planning.checkpoint import save_value
 from muxjax.planning.value import ValueNet, n_features, turn_by_a_tendon, value_net
 from muxjax.robot import Robot
-from training.config import TrainingConfig
+from training.config import TrainingConfig, keep_config
 from training.dataset import Decisions, commit, load_decisions, make_shards, shards_of
 
 _HUBER = 0.05  # error [scale] beyond which the value's loss is linear
@@ -92,7 +92,7 @@ def fit(config: TrainingConfig, out: Path, data: Path | None = None) -> ValueNet
         ConfigError: The folder holds a training of another configuration.
     """
     out.mkdir(parents=True, exist_ok=True)
-    _keep_config(config, out)
+    keep_config(config, out)
     robot = muxjax.load_robot(config.robot)
     began = time.monotonic()
     data = data or out / "data"
@@ -136,15 +136,6 @@ def fit(config: TrainingConfig, out: Path, data: Path | None = None) -> ValueNet
     print(f"{out / 'best.value'}: {about['curve']}")
     trainer.writer.close()
     return progress.best
-
-
-def _keep_config(config: TrainingConfig, out: Path) -> None:
-    """Write the configuration beside the weights, or compare it with the one that lies there."""
-    text = json.dumps(config.model_dump(mode="json", by_alias=True), indent=1)
-    kept = out / "config.json"
-    if kept.is_file() and kept.read_text() != text:
-        raise ConfigError(f"{out}: holds a training of another configuration; take another folder")
-    kept.write_text(text)
 
 
 class _Trainer:

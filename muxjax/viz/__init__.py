@@ -3,6 +3,22 @@
 ``programs`` draws arms and what programs do over time, ``statics`` postures under load.
 """
 
-from muxjax.viz.programs import SEGMENT_COLOURS, animate, colour, compare_programs, draw_arm, style
+from muxjax.viz.programs import (
+    SEGMENT_COLOURS,
+    animate,
+    arm_picture,
+    colour,
+    compare_programs,
+    draw_arm,
+    style,
+)
 
-__all__ = ["SEGMENT_COLOURS", "animate", "colour", "compare_programs", "draw_arm", "style"]
+__all__ = [
+    "SEGMENT_COLOURS",
+    "animate",
+    "arm_picture",
+    "colour",
+    "compare_programs",
+    "draw_arm",
+    "style",
+]

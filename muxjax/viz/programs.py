@@ -8,8 +8,9 @@ from typing import Any
 
 import matplotlib as mpl
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, UInt8
 from matplotlib.animation import FuncAnimation, PillowWriter
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from muxjax.kinematics import backbone
@@ -149,6 +150,31 @@ def draw_arm(
         _draw_discs(axes, robot, q, segment, alpha)
     for c in range(robot.n_tendons):
         _draw_tendon(axes, robot, frames, c, thick=c in moving, alpha=alpha)
+
+
+def arm_picture(
+    robot: Robot,
+    displacements: Float[np.ndarray, " SJ"],
+    target: Float[np.ndarray, " SJ"],
+    title: str,
+) -> UInt8[np.ndarray, "400 400 3"]:
+    """The arm, and pale where it is to go, as RGB pixels.
+
+    Args:
+        robot: The arm.
+        displacements: Tendon displacements [m].
+        target: Tendon displacements wanted [m].
+        title: Above the arm.
+    """
+    figure = Figure(figsize=(5, 5), dpi=80)
+    canvas = FigureCanvasAgg(figure)
+    axes = figure.add_subplot(projection="3d")
+    draw_arm(axes, robot, target, alpha=0.35)
+    draw_arm(axes, robot, displacements)
+    _frame_arm(axes, robot)
+    axes.set_title(title, fontsize=9)
+    canvas.draw()
+    return np.array(canvas.buffer_rgba())[..., :3]
 
 
 def _draw_discs(axes: Any, robot: Robot, q: Any, segment: int, alpha: float) -> None:

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 import muxjax
-from muxjax.planning import METHODS, PlanningError, Problem, plan
+from muxjax.planning import METHODS, PlanningError, Problem, plan, plan_each
 from muxjax.planning.axial import fewest_repositionings
 from muxjax.planning.bounds import AdmissibleBound
 from muxjax.planning.lattice import Lattice
@@ -291,6 +291,19 @@ def test_every_heuristic_certifies(muxarm, rng, heuristic):
     found = plan(muxarm, problem, "beamstep", width=16, heuristic=heuristic)
     assert found.lower_bound <= best * (1 + 1e-12)
     assert best <= found.cost * (1 + 1e-12)
+
+
+def test_plans_side_by_side_are_those_one_by_one(muxarm, rng):
+    problems = [
+        Problem(np.zeros(9), target, servos=SERVO_SETS[number], max_step=0.03)
+        for number, target in enumerate(random_targets(muxarm, rng, 6))
+    ]
+    together = plan_each(muxarm, problems, width=7)
+    for problem, found in zip(problems, together, strict=True):
+        alone = plan(muxarm, problem, "beamstep", width=7)
+        assert found.problem is problem
+        assert (found.cost, found.lower_bound) == (alone.cost, alone.lower_bound)
+        np.testing.assert_array_equal(found.displacements, alone.displacements)
 
 
 def test_a_value_function_guides_but_cannot_break_the_certificate(muxarm, rng):

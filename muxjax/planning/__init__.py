@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 from muxjax.planning.baselines import greedy, reverse, sequential
@@ -22,6 +23,7 @@ from muxjax.planning.problem import (
     check_problem,
 )
 from muxjax.planning.tension import Tension
+from muxjax.precision import cores
 from muxjax.robot import Robot
 
 METHODS: Mapping[str, Callable[..., Plan]] = {
@@ -47,6 +49,7 @@ __all__ = [
     "front",
     "plan",
     "plan_batch",
+    "plan_each",
 ]
 
 
@@ -76,3 +79,19 @@ def plan(robot: Robot, problem: Problem, method: str = "exact", **options: Any) 
         raise ValueError(f"{method}: has no option {', '.join(sorted(unknown))}")
     check_problem(robot, problem)
     return METHODS[method](Lattice(robot, problem), **options)
+
+
+def plan_each(
+    robot: Robot, problems: Iterable[Problem], method: str = "beamstep", **options: Any
+) -> list[Plan]:
+    """``plan`` for many problems on all cores, in their order.
+
+    Problems may differ in everything; those of one robot share the compiled search. For the costs
+    of full moves alone, ``plan_batch`` is faster.
+
+    Raises:
+        ValueError: See ``plan``.
+        PlanningError: See ``plan``.
+    """
+    with ThreadPoolExecutor(cores()) as pool:
+        return list(pool.map(lambda problem: plan(robot, problem, method, **options), problems))

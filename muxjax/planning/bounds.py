@@ -104,7 +104,7 @@ class AdmissibleBound:
         return found
 
 
-@lru_cache(maxsize=1)
+@lru_cache(maxsize=4)  # of lattices that are planned side by side
 def bound_of(lattice: Lattice) -> AdmissibleBound:
     """The lattice's bound; planners that follow each other share its pattern databases."""
     return AdmissibleBound(lattice)

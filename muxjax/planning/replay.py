@@ -114,7 +114,7 @@ def failed(lattice: Lattice, *, method: str, reason: str, expansions: int) -> Pl
     )
 
 
-@lru_cache(maxsize=1)
+@lru_cache(maxsize=4)  # of lattices that are planned side by side
 def _bound_at_start(lattice: Lattice) -> float:
     """What no plan can beat: of full moves their optimum, which takes less than patterns do."""
     if FullMoveTable.fits(lattice) and lattice.steps.any():

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from itertools import pairwise, permutations
 
+import jax
 import numpy as np
 import pytest
 from test_planning import random_targets
@@ -128,7 +129,8 @@ def test_no_point_of_the_arm_is_faster_than_its_bound(muxarm, rng):
     laden = attach(plain, [SphereConfig(kind="sphere", centre_m=far, radius_m=0.01)])
     starts, ends = random_targets(muxarm, rng, 40).reshape(2, 20, 9)
     fraction = np.linspace(0, 1, 801)[:, None]
-    limits = [np.asarray(speed_bound(muxarm, starts, ends, world)) for world in (plain, laden)]
+    with jax.enable_x64(True):  # as planners do
+        limits = [np.asarray(speed_bound(muxarm, starts, ends, world)) for world in (plain, laden)]
     tried = 0
     for start, end, arm_limit, laden_limit in zip(starts, ends, *limits, strict=True):
         q = muxjax.configuration_from_tendons(muxarm, start + fraction * (end - start))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import jax
 import numpy as np
 
-from muxjax.planning.arrays import lattice_arrays, level_room
+from muxjax.planning.arrays import level_room
 from muxjax.planning.bounds import bound_of
 from muxjax.planning.lattice import Lattice, Step
 from muxjax.planning.problem import PlanningError
@@ -35,10 +35,9 @@ class Beam:
             *lattice.problem.compiled_terms(expensive=True),
         )
         self._value = None if value_fn is None else traced(value_fn)
+        bound = bound_of(lattice)
         with jax.enable_x64(True):
-            self._arrays = jax.device_put(
-                (lattice_arrays(lattice), bound_of(lattice).arrays(heuristic))
-            )
+            self._arrays = jax.device_put((bound.lattice_arrays, bound.arrays(heuristic)))
 
     def search(self, width: int, best: float = np.inf) -> Found:
         """The best plan of at most ``width`` a level, if it costs less than ``best``.

@@ -49,7 +49,7 @@ class AdmissibleBound:
         self, remaining: Int[np.ndarray, "N SJ"], stop: Int[np.ndarray, " N"]
     ) -> Float[np.ndarray, " N"]:
         """Bound at states: steps that each tendon has to go, and the present stop, or -1."""
-        return np.asarray(self.arrays()(self._lattice_arrays, remaining, stop, np))
+        return np.asarray(self.arrays()(self.lattice_arrays, remaining, stop, np))
 
     def arrays(self, heuristic: str = "patterns") -> BoundArrays:
         """The bound, or a part of it, for compiled searches.
@@ -63,7 +63,8 @@ class AdmissibleBound:
         return bound_arrays(self._lattice, weights, self._last, patterns)
 
     @cached_property
-    def _lattice_arrays(self) -> LatticeArrays:
+    def lattice_arrays(self) -> LatticeArrays:
+        """The lattice, for compiled searches and for what guides them."""
         return lattice_arrays(self._lattice)
 
     @cached_property

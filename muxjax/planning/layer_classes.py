@@ -52,21 +52,40 @@ def moves_fit(lattice: Lattice) -> bool:
     return bool(np.prod(steps + 1.0, axis=1).max() * len(lattice.actions[0]) <= MOST_MOVES)
 
 
-def layer_classes(lattice: Lattice, layer: int) -> LayerClasses:
-    """Classes of one layer, from the base."""
+def layer_states(
+    lattice: Lattice, layer: int
+) -> tuple[slice, Int[np.ndarray, "P J"], Float[np.ndarray, "P J"]]:
+    """A layer's tendons, their steps to go in all its states, in order, and displacements [m]."""
     j = lattice.robot.tendons_per_segment
     columns = slice(layer * j, (layer + 1) * j)
-    steps = lattice.steps[columns]
-    left = np.indices([int(n) + 1 for n in steps]).reshape(j, -1).T
+    left = np.indices([int(n) + 1 for n in lattice.steps[columns]]).reshape(j, -1).T
     remaining = np.zeros((len(left), lattice.robot.n_tendons), dtype=np.int64)
     remaining[:, columns] = left
-    needed = _needed(lattice, left, int(lattice.reach.sum(axis=1).max()))
+    return columns, left, lattice.displacements(remaining)[:, columns]
+
+
+def steps_needed(lattice: Lattice, left: Int[np.ndarray, "P J"]) -> Int[np.ndarray, "P J"]:
+    """Fewest moves that finish each tendon with so many steps to go."""
+    # In these action sets one move may finish a tendon.
+    return np.minimum(left, 1) if lattice.problem.action_set in ("multistep", "splits") else left
+
+
+def fewest_actions(lattice: Lattice, left: Int[np.ndarray, "P J"]) -> Int[np.ndarray, " P"]:
+    """Fewest actions that finish a layer: a tendon's own, and all by the servos."""
+    needed, servos = steps_needed(lattice, left), int(lattice.reach.sum(axis=1).max())
+    return np.asarray(np.maximum(needed.max(axis=-1), -(-needed.sum(axis=-1) // servos)))
+
+
+def layer_classes(lattice: Lattice, layer: int) -> LayerClasses:
+    """Classes of one layer, from the base."""
+    columns, left, lengths = layer_states(lattice, layer)
+    steps, needed = lattice.steps[columns], fewest_actions(lattice, left)
     status, partly = _status(left, steps), ((left > 0) & (left < steps)).sum(axis=1)
     key = status * (int(needed.max()) + 1) + needed
     _, first, of_state = np.unique(key, return_index=True, return_inverse=True)
     stops = np.flatnonzero(lattice.reach[:, columns].any(axis=1))
     return LayerClasses(
-        lengths=lattice.displacements(remaining)[:, columns],
+        lengths=lengths,
         of_state=of_state,
         untouched=int(of_state[-1]),
         stops=stops,
@@ -75,13 +94,6 @@ def layer_classes(lattice: Lattice, layer: int) -> LayerClasses:
         status=status[first],
         on_their_way=partly[first],
     )
-
-
-def _needed(lattice: Lattice, left: Int[np.ndarray, "P J"], servos: int) -> Int[np.ndarray, " P"]:
-    """Fewest actions: a tendon's own, and all by the servos."""
-    if lattice.problem.action_set in ("multistep", "splits"):
-        left = np.minimum(left, 1)  # one action may finish a tendon
-    return np.asarray(np.maximum(left.max(axis=-1), -(-left.sum(axis=-1) // servos)))
 
 
 def _status(left: Int[np.ndarray, "P J"], steps: Int[np.ndarray, " J"]) -> Int[np.ndarray, " P"]:

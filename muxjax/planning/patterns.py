@@ -22,6 +22,7 @@ from jaxtyping import Float, Int
 from muxjax.planning.arrays import PatternArrays, pattern_arrays
 from muxjax.planning.extents import extents, least_angles, runs_straight
 from muxjax.planning.lattice import Lattice
+from muxjax.planning.layer_classes import fewest_actions, layer_states, steps_needed
 from muxjax.planning.motion import STRAIGHT
 from muxjax.planning.pair_patterns import Points, least_bending, pairs_fit
 
@@ -58,7 +59,7 @@ def visit_pattern(
     if not (lattice.one_layer_a_step and few):
         return None
     layers = min(robot.n_segments, 3)
-    points = [_points(lattice, layer, servos, in_actions) for layer in range(layers)]
+    points = [_points(lattice, layer, in_actions) for layer in range(layers)]
     if not (runs_straight(robot) or pairs_fit(points)):
         return None
     node, waiting = _least_costs(lattice, points, prices, goal)
@@ -81,23 +82,15 @@ def visit_pattern(
     )
 
 
-def _points(lattice: Lattice, layer: int, servos: int, in_actions: bool) -> Points:
+def _points(lattice: Lattice, layer: int, in_actions: bool) -> Points:
     """Displacements [m] and class of every state of a layer, in the order of its steps to go."""
-    j = lattice.robot.tendons_per_segment
-    columns = slice(layer * j, (layer + 1) * j)
-    steps = lattice.steps[columns]
-    left = np.indices([int(n) + 1 for n in steps]).reshape(j, -1).T
-    remaining = np.zeros((len(left), lattice.robot.n_tendons), dtype=np.int64)
-    remaining[:, columns] = left
-    needed = left
-    if lattice.problem.action_set in ("multistep", "splits"):
-        needed = np.minimum(left, 1)  # one action may finish a tendon
-    total = needed.sum(axis=-1)
-    # Steps that finish the layer, or fewest actions: a tendon's own, and all by the servos.
-    classes = np.maximum(needed.max(axis=-1), -(-total // servos)) if in_actions else total
-    untouched = (left == steps).all(axis=-1) & (classes[-1] > 0)
-    classes = np.where(untouched, classes[-1] + 1, classes)
-    return lattice.displacements(remaining)[:, columns], classes
+    columns, left, lengths = layer_states(lattice, layer)
+    if in_actions:
+        classes = fewest_actions(lattice, left)
+    else:
+        classes = steps_needed(lattice, left).sum(axis=-1)
+    untouched = (left == lattice.steps[columns]).all(axis=-1) & (classes[-1] > 0)
+    return lengths, np.where(untouched, classes[-1] + 1, classes)
 
 
 def _least_costs(

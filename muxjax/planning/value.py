@@ -21,7 +21,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.linalg import block_diag
 
-from muxjax.planning.arrays import BoundArrays, LatticeArrays, lattice_arrays
+from muxjax.planning.arrays import BoundArrays, LatticeArrays
 from muxjax.planning.bounds import bound_of
 from muxjax.planning.lattice import Lattice
 from muxjax.planning.motion import angles_at, bending_angles
@@ -176,12 +176,13 @@ def context_of(lattice: Lattice) -> Context:
     robot, problem = lattice.robot, lattice.problem
     ways = np.abs(problem.target - problem.start).reshape(robot.n_segments, -1)
     ways = np.where(lattice.steps.reshape(ways.shape) > 0, ways, 0.0)
+    bound = bound_of(lattice)
     rates, blocked = _probes(lattice)
     seconds, typical = _typical(lattice, ways, float(np.mean(rates)))
     scale = max(float(typical.sum()), 1e-12)
     return Context(
-        lattice=lattice_arrays(lattice),
-        bound=bound_of(lattice).arrays("count"),
+        lattice=bound.lattice_arrays,
+        bound=bound.arrays("count"),
         scale=np.asarray(scale),
         way=ways.sum(axis=1),
         objective=typical / scale,

@@ -27,6 +27,7 @@ from jaxtyping import Float
 
 import muxjax
 from muxjax.planning.beamstep import beamstep
+from muxjax.planning.bounds import bound_of
 from muxjax.planning.exact import DEFAULT_MEMORY
 from muxjax.planning.lattice import Lattice
 from muxjax.planning.learned import learned_value
@@ -40,6 +41,7 @@ from training.problems import Regime, random_problem
 
 ACTIONS = 8  # of a decision: the best ones, and others at random
 _WANDER = 0.3  # share of random steps of the walks on which states are met
+_ABREAST = 16  # walks side by side, where many decisions are cheap
 
 
 class Decisions(NamedTuple):
@@ -98,15 +100,46 @@ def exact_decisions(
             first = False
 
 
+def bounded_decisions(
+    lattice: Lattice, count: int, rng: np.random.Generator
+) -> Iterator[tuple[Choices, np.ndarray]]:
+    """Actions of states on walks that follow the full bound, more or less, which is their label."""
+    bound, (stops, _) = bound_of(lattice), lattice.actions
+    remaining = np.repeat(lattice.steps[None], _ABREAST, axis=0)
+    stop, first = np.full(_ABREAST, lattice.start_stop), True
+    wander = rng.uniform(0.0, 2 * _WANDER, _ABREAST)
+    rows: list[tuple[Choices, np.ndarray]] = []
+    while len(remaining):
+        possible, moves = lattice.expand(remaining)
+        walk, action = np.nonzero(possible)
+        made, at = moves[walk, action], stops[action]
+        cost = _price(lattice, remaining[walk], made, at == stop[walk], first)
+        to_go = bound(remaining[walk] - made, at)
+        through = np.full(possible.shape, np.inf)
+        through[walk, action] = cost + to_go
+        taken = np.argmin(through, axis=1)
+        chances = np.where(np.isfinite(through), rng.random(through.shape), np.inf)
+        taken = np.where(rng.random(len(taken)) < wander, np.argmin(chances, axis=1), taken)
+        for k, here in enumerate(remaining):
+            own = walk == k
+            if own.sum() > 1:
+                rows.append((Choices(at[own], made[own], cost[own], to_go[own]), here))
+        remaining = remaining - moves[np.arange(len(taken)), taken]
+        goes_on = remaining.any(axis=1)
+        remaining, stop, wander = remaining[goes_on], stops[taken][goes_on], wander[goes_on]
+        first = False
+    return (rows[i] for i in np.sort(rng.permutation(len(rows))[:count]))
+
+
 def searched_decisions(
     lattice: Lattice, width: int, net: ValueNet | None, rng: np.random.Generator
 ) -> Iterator[tuple[Choices, np.ndarray]]:
     """Actions along the best plan of a beam: its own with what is left of its cost, and others."""
     if net is None:
         found = beamstep(lattice, width=width)
-    else:  # the network stands in for pattern databases, which take longer to build than to search
+    else:  # the bound certifies, the network orders
         value = learned_value(lattice, net)
-        found = beamstep(lattice, width=width, heuristic="count", value_fn=value)
+        found = beamstep(lattice, width=width, value_fn=value)
     if found.status == "failed":
         return
     left = lattice.remaining(found.displacements)
@@ -162,6 +195,8 @@ def decisions_of(
     lattice = Lattice(robot, _asked(problem) if regime.labels == "exact" else problem)
     if regime.labels == "exact":
         rows = list(exact_decisions(lattice, regime.decisions, rng))
+    elif regime.labels == "bound":
+        rows = list(bounded_decisions(lattice, regime.decisions, rng))
     else:
         rows = list(searched_decisions(lattice, width, net, rng))
         rows = [rows[i] for i in np.sort(rng.permutation(len(rows))[: regime.decisions])]
@@ -282,7 +317,9 @@ def make_shards(
                 f"{folder}: holds data with another {', '.join(differs)}; take another folder"
             )
     else:
-        manifest.write_text(json.dumps({**about, "commit": commit(), "shards": {}}, indent=1))
+        manifest.write_text(
+            json.dumps({**about, "commit": commit(), "cpu_s": 0.0, "shards": {}}, indent=1)
+        )
     tasks = [
         _Task(folder / f"{regime.name}_{k:04d}.npz", robot, regime, width, (seed, r, k), n, net)
         for r, regime in enumerate(regimes)
@@ -293,10 +330,13 @@ def make_shards(
     # Spawned: a fork would inherit the threads of the compiler.
     with ProcessPoolExecutor(workers or os.cpu_count(), get_context("spawn")) as pool:
         for future in as_completed([pool.submit(_make, task) for task in open_tasks]):
-            name, decisions = future.result()
+            name, decisions, cpu_s = future.result()
             done += 1
             seconds = time.monotonic() - began
             print(f"{done}/{len(tasks)} {name}: {decisions} decisions, {seconds:.0f} s", flush=True)
+            known = json.loads(manifest.read_text())
+            known["cpu_s"] = round(known["cpu_s"] + cpu_s, 1)
+            manifest.write_text(json.dumps(known, indent=1))
     shards = {task.path.name: _digest(task.path) for task in tasks}
     manifest.write_text(
         json.dumps({**json.loads(manifest.read_text()), "shards": shards}, indent=1)
@@ -307,7 +347,8 @@ def _sizes(problems: int, shard: int) -> list[int]:
     return [min(shard, problems - i) for i in range(0, problems, shard)]
 
 
-def _make(task: _Task) -> tuple[str, int]:
+def _make(task: _Task) -> tuple[str, int, float]:
+    began = time.process_time()
     # Every process would compile the same searches anew, for minutes.
     jax.config.update("jax_compilation_cache_dir", str(task.path.parent / "compiled"))
     robot = muxjax.load_robot(task.robot)
@@ -322,7 +363,7 @@ def _make(task: _Task) -> tuple[str, int]:
     partial = task.path.with_suffix(".partial.npz")
     np.savez(partial, **whole._asdict())
     os.replace(partial, task.path)
-    return task.path.name, len(whole.bound)
+    return task.path.name, len(whole.bound), time.process_time() - began
 
 
 def load_decisions(folder: Path, names: list[str] | None = None) -> Decisions:
@@ -353,6 +394,11 @@ def shards_of(folder: Path) -> dict[str, str]:
     if not shards:
         raise ValueError(f"{folder}: holds no complete data")
     return dict(shards)
+
+
+def label_seconds(folder: Path) -> float:
+    """CPU time that the labels of a folder took [s]."""
+    return float(json.loads((folder / "manifest.json").read_text())["cpu_s"])
 
 
 def _digest(path: Path) -> str:

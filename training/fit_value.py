@@ -33,7 +33,14 @@ from muxjax.planning.checkpoint import save_value
 from muxjax.planning.value import ValueNet, n_features, turn_by_a_tendon, value_net
 from muxjax.robot import Robot
 from training.config import TrainingConfig, keep_config
-from training.dataset import Decisions, commit, load_decisions, make_shards, shards_of
+from training.dataset import (
+    Decisions,
+    commit,
+    label_seconds,
+    load_decisions,
+    make_shards,
+    shards_of,
+)
 
 _HUBER = 0.05  # error [scale] beyond which the value's loss is linear
 
@@ -94,7 +101,7 @@ def fit(config: TrainingConfig, out: Path, data: Path | None = None) -> ValueNet
     out.mkdir(parents=True, exist_ok=True)
     keep_config(config, out)
     robot = muxjax.load_robot(config.robot)
-    began = time.monotonic()
+    began, cpu = time.monotonic(), time.process_time()
     data = data or out / "data"
     make_shards(
         data,
@@ -130,7 +137,10 @@ def fit(config: TrainingConfig, out: Path, data: Path | None = None) -> ValueNet
         "config": config.model_dump(mode="json", by_alias=True),
         "commit": commit(),
         "curve": json.loads((out / "curve.json").read_text())[-1],
-        "seconds": round(time.monotonic() - began),
+        "cpu_s": {
+            "labels": round(sum(label_seconds(folder) for folder in folders)),
+            "training": round(time.process_time() - cpu),
+        },
     }
     save_value(out / "best.value", progress.best, robot, about)
     print(f"{out / 'best.value'}: {about['curve']}")

@@ -25,8 +25,9 @@ class Regime(Strict):
     Attributes:
         name: Of the regime.
         problems: How many, for training.
-        labels: "exact": cost to go by the certified optimum, of any state; "search": by a beam, of
-            the states that its best plan passes.
+        labels: "exact": cost to go by the certified optimum, of any state; "bound": by the pattern
+            database, of any state, where its terms are all that the objective has; "search": by a
+            beam, of the states that its best plan passes.
         decisions: States from which the actions are labelled, of each problem.
         max_step_mm: Steps to choose from; null for full moves.
         servo_sets: Sets of healthy servos to choose from; by default all.
@@ -41,7 +42,7 @@ class Regime(Strict):
 
     name: str
     problems: Annotated[int, Field(ge=0)] = 0
-    labels: Literal["exact", "search"] = "exact"
+    labels: Literal["exact", "bound", "search"] = "exact"
     decisions: Annotated[int, Field(ge=1)] = 48
     max_step_mm: tuple[Positive | None, ...] = (None,)
     servo_sets: tuple[tuple[int, ...], ...] | None = None

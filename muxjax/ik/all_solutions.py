@@ -16,7 +16,6 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 from jaxtyping import Bool, Float, Int
-from scipy.stats import qmc
 
 from muxjax.batched import WIDE_VECTORS
 from muxjax.batched.formulas import product
@@ -119,6 +118,8 @@ def _searched(
     rows: Int[np.ndarray, " n"],
 ) -> tuple[Int[np.ndarray, " m"], Float[np.ndarray, "6 m"]]:
     """The last resort: where damped steps from starts all over the limits come near a target."""
+    from scipy.stats import qmc  # takes a third of a second to import, and is seldom needed
+
     unit = qmc.Halton(6, scramble=False).random(STARTS + 1)[1:]
     theta, phi = theta_max * np.sqrt(unit[:, :3]), 2 * np.pi * unit[:, 3:]
     starts = np.stack([theta * np.cos(phi), theta * np.sin(phi)], axis=-1).reshape(STARTS, 6)

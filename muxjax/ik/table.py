@@ -9,7 +9,6 @@ import jax
 import numpy as np
 from jaxtyping import Float
 from scipy.spatial import cKDTree
-from scipy.stats import qmc
 
 from muxjax.batched import poses
 from muxjax.ik.frames import inverse, quaternion
@@ -54,6 +53,8 @@ def _table(*_: object):  # type: ignore[no-untyped-def]
 
 
 def _make(robot: Robot) -> Table:
+    from scipy.stats import qmc  # here and not above: it takes a third of a second to import
+
     b = bendings(robot, qmc.Sobol(2 * robot.n_segments, scramble=False).random(ENTRIES))
     frames = poses(robot, b.reshape(ENTRIES, -1, 2).astype(np.float32), "matrix")
     inner = inverse(np.asarray(robot.base)) @ frames.astype(np.float64)

@@ -2,7 +2,8 @@
 
 A policy names a tendon; the axial motor goes to a stop where an available servo meets it, and
 every available servo that meets an unfinished tendon there moves it along. The scans finish what
-they started, the greedy rule chooses again after every clipped step.
+they started, the greedy rule chooses again after every clipped step. A caller that knows a lower
+bound saves the time to find one.
 """
 
 from __future__ import annotations
@@ -19,22 +20,36 @@ from muxjax.planning.replay import replay
 Policy = Callable[[Int[np.ndarray, " SJ"], Float[np.ndarray, " SJ"]], int]
 
 
-def sequential(lattice: Lattice) -> Plan:
+def sequential(lattice: Lattice, lower_bound: float | None = None) -> Plan:
     """Tendons 1 to S*J in order (M Eq. 13a)."""
-    return _run(lattice, lambda remaining, _: int(np.flatnonzero(remaining)[0]), True, "sequential")
+    return _run(
+        lattice,
+        lambda remaining, _: int(np.flatnonzero(remaining)[0]),
+        True,
+        "sequential",
+        lower_bound,
+    )
 
 
-def reverse(lattice: Lattice) -> Plan:
+def reverse(lattice: Lattice, lower_bound: float | None = None) -> Plan:
     """Tendons S*J to 1 in order (M Eq. 13b)."""
-    return _run(lattice, lambda remaining, _: int(np.flatnonzero(remaining)[-1]), True, "reverse")
+    return _run(
+        lattice,
+        lambda remaining, _: int(np.flatnonzero(remaining)[-1]),
+        True,
+        "reverse",
+        lower_bound,
+    )
 
 
-def greedy(lattice: Lattice) -> Plan:
+def greedy(lattice: Lattice, lower_bound: float | None = None) -> Plan:
     """The tendon with the largest residual, anew at every step (M Eq. 13c)."""
-    return _run(lattice, lambda _, residual: int(np.argmax(residual)), False, "greedy")
+    return _run(lattice, lambda _, residual: int(np.argmax(residual)), False, "greedy", lower_bound)
 
 
-def _run(lattice: Lattice, choose: Policy, to_the_end: bool, method: str) -> Plan:
+def _run(
+    lattice: Lattice, choose: Policy, to_the_end: bool, method: str, lower_bound: float | None
+) -> Plan:
     remaining, stop = lattice.steps.copy(), lattice.start_stop
     steps: list[Step] = []
     while remaining.any():
@@ -47,7 +62,7 @@ def _run(lattice: Lattice, choose: Policy, to_the_end: bool, method: str) -> Pla
             remaining = remaining - moves
             if not (to_the_end and _unfinished_at(lattice, stop, remaining)):
                 break
-    return replay(lattice, steps, method=method)
+    return replay(lattice, steps, method=method, lower_bound=lower_bound)
 
 
 def _unfinished_at(lattice: Lattice, stop: int, remaining: Int[np.ndarray, " SJ"]) -> bool:

@@ -52,7 +52,8 @@ def beamstep(
     """
     _check_options(width, heuristic, gap, deadline_s)
     began = monotonic()
-    incumbent = min((rule(lattice) for rule in (sequential, reverse, greedy)), key=lambda p: p.cost)
+    known = (rule(lattice, lower_bound=0.0) for rule in (sequential, reverse, greedy))
+    incumbent = min(known, key=lambda plan: plan.cost)
     cost, steps = incumbent.cost, None
     proved, expansions = 0.0, 0
     beam = Beam(lattice, heuristic, value_fn)

@@ -38,6 +38,7 @@ ValueFunction = Callable[[States], Float[Array, " N"]]
 """Estimated cost to go: a JAX function. An ``equinox.Module``'s arrays are traced."""
 
 _SHORTLIST = 4  # times the width: plans, by promise, that a value function puts in order
+_SHORTEST = 16  # but no fewer than this: a narrow beam is cheap, and needs the order most
 _HASHED = 4  # places in the table of states for every child
 _ROUNDS = 2  # of reducing equal states; in each, few are missed because their places collide
 
@@ -249,11 +250,12 @@ def _first(
     if value is None:
         least, kept = _lowest(promise, min(rows, n))
     else:
-        least, few = _lowest(promise, min(_SHORTLIST * rows, n))
+        least, few = _lowest(promise, min(max(_SHORTLIST * rows, _SHORTEST), n))
         remaining, stop = kids.remaining[few], kids.stop[few]
         at = lattice.displacements(remaining)
         order = kids.cost[few] + value(States(at, remaining, stop, lattice.axial[stop], to_go[few]))
-        hopeful = jnp.isfinite(least) & (jnp.arange(len(few)) < _SHORTLIST * width)
+        longest = jnp.maximum(_SHORTLIST * width, _SHORTEST)
+        hopeful = jnp.isfinite(least) & (jnp.arange(len(few)) < longest)
         least, best = _lowest(jnp.where(hopeful, order, jnp.inf), min(rows, n))
         kept = few[best]
     exists = jnp.isfinite(least) & (jnp.arange(len(kept)) < width)

@@ -2,20 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Annotated, Literal, TypeVar
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Annotated, Any, Literal, TypeVar
 
 import numpy as np
 from pydantic import Field, model_validator
 
 import muxjax
-from muxjax.config import NotNegative, Positive, Strict
+from muxjax.config import ConfigError, NotNegative, Positive, Strict
 from muxjax.planning import Problem
-from muxjax.planning.problem import check_problem, preset_weights
+from muxjax.planning.problem import COLLISION, check_problem, preset_weights
 from muxjax.robot import Robot
 
 T = TypeVar("T")
 
+_SCHEMA = "muxjax/problems/1"
 _TRIES = 1000  # draws of a problem that a robot and world allow
 
 
@@ -75,6 +78,72 @@ def random_problem(robot: Robot, regime: Regime, rng: np.random.Generator) -> Pr
             continue
         return problem
     raise ValueError(f"{regime.name}: no problem that the robot and the world allow")
+
+
+def write_problems(path: Path, robot: Robot, problems: Mapping[str, Sequence[Problem]]) -> None:
+    """Write problems by regime, a line each; worlds by name.
+
+    Args:
+        path: Of the JSON file.
+        robot: Whose problems they are.
+        problems: By name of their regime.
+    """
+    head = {"schema": _SCHEMA, "robot": robot.config.name, "fingerprint": robot.fingerprint}
+    lines = [
+        f"{json.dumps(name)}: [\n" + ",\n".join(json.dumps(_document(p)) for p in rows) + "\n]"
+        for name, rows in problems.items()
+    ]
+    text = json.dumps(head)[:-1] + ', "problems": {\n' + ",\n".join(lines) + "\n}}\n"
+    path.write_text(text)
+
+
+def read_problems(path: Path, robot: Robot) -> dict[str, list[Problem]]:
+    """Problems of a file that ``write_problems`` wrote, by regime.
+
+    Raises:
+        ConfigError: No such file, another kind of file, or problems of another robot.
+    """
+    try:
+        document = json.loads(path.read_text())
+        schema, fingerprint = document["schema"], document["fingerprint"]
+        found = {k: [_problem(d) for d in rows] for k, rows in document["problems"].items()}
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise ConfigError(f"{path}: is no file of problems ({error})") from None
+    if schema != _SCHEMA:
+        raise ConfigError(f"{path}: schema is {schema!r}, must be {_SCHEMA!r}")
+    if fingerprint != robot.fingerprint:
+        raise ConfigError(f"{path}: holds problems of another robot than {robot.config.name!r}")
+    for rows in found.values():
+        for problem in rows:
+            check_problem(robot, problem)
+    return found
+
+
+def _document(problem: Problem) -> dict[str, Any]:
+    return {
+        "start": problem.start.tolist(),
+        "target": problem.target.tolist(),
+        "servos": list(problem.servos),
+        "max_step": problem.max_step,
+        "weights": {k: v for k, v in problem.cost_weights.items() if k != COLLISION},
+        "axial": problem.axial,
+        "action_set": problem.action_set,
+        "world": None if problem.world is None else problem.world.name,
+    }
+
+
+def _problem(document: Mapping[str, Any]) -> Problem:
+    world = document["world"]
+    return Problem(
+        start=np.array(document["start"]),
+        target=np.array(document["target"]),
+        servos=tuple(document["servos"]),
+        max_step=document["max_step"],
+        weights=document["weights"],
+        axial=document["axial"],
+        action_set=document["action_set"],
+        world=None if world is None else muxjax.load_world(world),
+    )
 
 
 def _drawn(robot: Robot, regime: Regime, rng: np.random.Generator) -> Problem:

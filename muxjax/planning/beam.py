@@ -24,6 +24,9 @@ class Beam:
         lattice: The problem on the robot.
         heuristic: As in ``beamstep``.
         value_fn: As in ``beamstep``.
+
+    Attributes:
+        arrays: The lattice's and the bound's, on the device.
     """
 
     def __init__(
@@ -37,7 +40,7 @@ class Beam:
         self._value = None if value_fn is None else traced(value_fn)
         bound = bound_of(lattice)
         with jax.enable_x64(True):
-            self._arrays = jax.device_put((bound.lattice_arrays, bound.arrays(heuristic)))
+            self.arrays = jax.device_put((bound.lattice_arrays, bound.arrays(heuristic)))
 
     def search(self, width: int, best: float = np.inf) -> Found:
         """The best plan of at most ``width`` a level, if it costs less than ``best``.
@@ -49,7 +52,7 @@ class Beam:
             found = search(
                 self.lattice.robot,
                 *self._terms,
-                *self._arrays,
+                *self.arrays,
                 self._value,
                 np.int32(width),
                 np.float64(best),

@@ -91,7 +91,7 @@ def picture_of_front(records: tuple[Path, ...], out: Path = Path("out/front.png"
     for panel in panels.flat:
         for handle, label in zip(*panel.get_legend_handles_labels(), strict=True):
             handles.setdefault(label, handle)
-    figure.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=6)
+    figure.legend(list(handles.values()), list(handles), loc="outside lower center", ncols=6)
     return _written(figure, out)
 
 

@@ -87,7 +87,7 @@ def picture_of_front(records: tuple[Path, ...], out: Path = Path("out/front.png"
         panel.set(title=regime, xlabel="time with tables [ms]", ylabel="over the best known [%]")
     for panel in panels.flat[len(regimes) :]:
         panel.axis("off")
-    handles = {}
+    handles: dict[str, Any] = {}
     for panel in panels.flat:
         for handle, label in zip(*panel.get_legend_handles_labels(), strict=True):
             handles.setdefault(label, handle)

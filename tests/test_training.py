@@ -185,7 +185,7 @@ def test_the_comparison_keeps_its_records(tmp_path, muxarm):
     before = (tmp_path / "out" / "report.md").read_text()
     main(options)  # nothing is measured again
     assert (tmp_path / "out" / "report.md").read_text() == before
-    assert "| exact | 100 | 0.00 (0.00)" in before
+    assert "| **exact** | 100 | 0.00 (0.00)" in before
 
 
 def test_the_shipped_problems_are_those_of_their_seed(muxarm):

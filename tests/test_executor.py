@@ -330,7 +330,7 @@ def test_gear_that_falls_short_is_trimmed_by_the_wheel(muxarm):
 @pytest.mark.parametrize(
     ("share", "move", "reason"),
     [
-        (0.5, 0.001, f"counts off after {MAX_TRIMS} trims"),
+        (0.55, 0.001, f"counts off after {MAX_TRIMS} trims"),
         (0.6, 0.02, r"wheel moved 12.00 mm while servo 1 turned for 20.00 mm"),
     ],
 )

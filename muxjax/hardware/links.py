@@ -10,7 +10,7 @@ from __future__ import annotations
 import secrets
 import time
 from collections.abc import Callable, Collection, Iterable
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float
@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     import can
 
 
+@runtime_checkable
 class Link(Protocol):
     """What ``execute`` needs of a way to a board."""
 

@@ -12,8 +12,8 @@ import pytest
 import muxjax
 from muxjax.config import RobotConfig
 from muxjax.hardware import BusLink, LockstepLink, VirtualBoard, execute
-from muxjax.hardware.links import serve
 from muxjax.hardware.protocol import BoardState, Frame
+from muxjax.hardware.serving import BusWire, serve
 from muxjax.hardware.visits import load_visits, motions
 from muxjax.robot import Robot, robot_from_config
 from muxjax.scheduler import Instruction, Program
@@ -383,7 +383,7 @@ def test_over_a_python_can_bus(muxarm):
         can.Bus("muxjax-test", interface="virtual") as host,
         can.Bus("muxjax-test", interface="virtual") as far,
     ):
-        thread = threading.Thread(target=serve, args=(board, far, done.is_set))
+        thread = threading.Thread(target=serve, args=(board, BusWire(far), done.is_set))
         thread.start()
         try:
             run = execute(

@@ -12,7 +12,8 @@ import logging
 import secrets
 import time
 from collections import Counter
-from collections.abc import Collection, Iterable
+from collections.abc import Collection, Iterable, Iterator
+from contextlib import contextmanager, suppress
 from typing import TYPE_CHECKING, Protocol, runtime_checkable
 
 import numpy as np
@@ -31,6 +32,7 @@ if TYPE_CHECKING:
 
 AT_ONCE = 64  # frames taken from a bus before the executor looks at them
 ERROR_PAUSE_S = 0.001
+SEND_S = 0.01  # a bus that takes a frame later than this has lost it
 
 
 @runtime_checkable
@@ -193,7 +195,8 @@ class BusLink:
         return
 
 
-def open_bus(spec: str) -> can.BusABC:
+@contextmanager
+def open_bus(spec: str) -> Iterator[can.BusABC]:
     """A python-can bus, from the arguments of ``can.Bus`` or from python-can's configuration.
 
     Args:
@@ -210,10 +213,16 @@ def open_bus(spec: str) -> can.BusABC:
     logging.getLogger("can").setLevel(logging.ERROR)
     try:
         if spec.lstrip().startswith("{"):
-            return can.Bus(**json.loads(spec))
-        return can.Bus(config_context=spec)
+            bus = can.Bus(**json.loads(spec))
+        else:
+            bus = can.Bus(config_context=spec)
     except (can.CanError, TypeError, ValueError) as error:
         raise ValueError(f"bus: {spec} cannot be opened: {error}") from error
+    try:
+        yield bus
+    finally:
+        with suppress(*_bus_errors()):  # slcan writes to an adapter that may be gone
+            bus.shutdown()
 
 
 def _bus_errors() -> tuple[type[Exception], ...]:
@@ -228,7 +237,8 @@ def send_frames(bus: can.BusABC, frames: Iterable[Frame]) -> None:
     import can
 
     for frame in frames:
-        bus.send(can.Message(arbitration_id=frame.id, data=frame.data, is_extended_id=False))
+        message = can.Message(arbitration_id=frame.id, data=frame.data, is_extended_id=False)
+        bus.send(message, timeout=SEND_S)
 
 
 def receive_frames(bus: can.BusABC, timeout: float) -> list[Frame]:

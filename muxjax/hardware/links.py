@@ -156,7 +156,7 @@ class BusLink:
         stream_divider: As for ``LockstepLink``; for slow serial links.
 
     Attributes:
-        errors: What the bus has raised so far, counted by its text.
+        errors: What the bus has raised so far, counted by kind.
     """
 
     def __init__(self, bus: can.BusABC, robot: Robot, stream_divider: int = 1) -> None:
@@ -179,16 +179,25 @@ class BusLink:
         try:
             send_frames(self._bus, frames)
         except _bus_errors() as error:
-            self.errors[repr(error)] += 1
+            self.errors[type(error).__name__] += 1
 
     def wait(self, until: float) -> list[Frame]:
         """The frames that are there, or the first one to come by ``until`` [s]."""
         try:
             return receive_frames(self._bus, until - self.now)
         except _bus_errors() as error:
-            self.errors[repr(error)] += 1
-            time.sleep(ERROR_PAUSE_S)  # a bus that is gone raises at once, and for ever
+            self.errors[type(error).__name__] += 1
+            if isinstance(error.__cause__, UnicodeDecodeError):
+                self._forget_line()
+            time.sleep(ERROR_PAUSE_S)  # a bus that is gone raises at once
             return []
+
+    def _forget_line(self) -> None:
+        """Slcan keeps a line that it cannot read, and raises for ever; its flush drops it."""
+        flush = getattr(self._bus, "flush", None)
+        if flush is not None:
+            with suppress(*_bus_errors()):
+                flush()
 
     def trajectory(self, since: float) -> None:
         """Nobody sees the truth of a real arm."""

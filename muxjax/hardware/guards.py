@@ -57,7 +57,7 @@ class Guards:
 
     def begin_move(self, board: VirtualBoard) -> None:
         """From here wheels are compared with their servos."""
-        self._mark = board.senses.servo_bits(), board.senses.wheel_counts()
+        self._mark = board.senses.servo_bits(), board.senses.wheel_counts().copy()
 
     def end_move(self) -> None:
         """Wheels are compared no longer."""

@@ -53,6 +53,7 @@ class Mechanics:
         self.time = 0.0
         self.displacements = np.array(displacements, dtype=np.float64)
         self.wheels = self.displacements.copy()
+        self.windings = 0  # how often a wheel has changed
         self.servo = np.zeros(robot.tendons_per_segment)
         self._slot_angle = 2 * math.pi / len(robot.axial_map)
         self._slots = len(robot.axial_map)
@@ -142,6 +143,7 @@ class Mechanics:
         self._wind(self.coupled[servo], way - held)
 
     def _wind(self, tendon: int, by: float) -> None:
+        self.windings += 1
         self.wheels[tendon] += by
         self.displacements[tendon] += by
 

@@ -56,9 +56,13 @@ def report(verdicts: list[Verdict], cpu: float) -> str:
             f"completed: wheels within {measured.max():.4f} mm of their goals as measured, true "
             f"lengths within {true.max():.4f} mm (median {np.median(true):.4f} mm)"
         )
-    for v in bad[:20]:
-        lines.append(f"  seed {v.seed}: {'; '.join(v.offences)} [{v.reason}]")
     return "\n".join(lines)
+
+
+def tell(verdict: Verdict) -> None:
+    """A line for a run with an offence."""
+    if verdict.offences:
+        print(f"seed {verdict.seed}: {'; '.join(verdict.offences)} [{verdict.reason}]", flush=True)
 
 
 def replay(seed: int) -> int:
@@ -71,6 +75,7 @@ def replay(seed: int) -> int:
         print(fault)
     verdict = run(robot, scenario)
     print("\n".join(verdict.steps))
+    tell(verdict)
     print(report([verdict], 0.0))
     return len(verdict.offences)
 
@@ -90,8 +95,9 @@ def main() -> int:
     for some, took in played(options.seed, options.runs, options.workers):
         verdicts += some
         cpu += took
-        bad = sum(bool(v.offences) for v in verdicts)
-        print(f"\r{len(verdicts)} runs, {bad} with offences", end="", file=sys.stderr, flush=True)
+        for verdict in some:
+            tell(verdict)
+        print(f"\r{len(verdicts)} of {options.runs} runs", end="", file=sys.stderr, flush=True)
     print(file=sys.stderr)
     print(report(verdicts, cpu))
     return int(any(v.offences for v in verdicts))

@@ -12,9 +12,8 @@ import pytest
 import muxjax
 from muxjax.config import RobotConfig
 from muxjax.hardware import BusLink, LockstepLink, VirtualBoard, execute
-from muxjax.hardware.links import serve
 from muxjax.hardware.protocol import BoardState, Frame
-from muxjax.hardware.transaction import MAX_TRIMS
+from muxjax.hardware.serving import BusWire, serve
 from muxjax.hardware.visits import load_visits, motions
 from muxjax.robot import Robot, robot_from_config
 from muxjax.scheduler import Instruction, Program
@@ -330,11 +329,12 @@ def test_gear_that_falls_short_is_trimmed_by_the_wheel(muxarm):
 @pytest.mark.parametrize(
     ("share", "move", "reason"),
     [
-        (0.5, 0.001, f"counts off after {MAX_TRIMS} trims"),
+        (0.55, 0.001, "counts off after 3 trims"),
         (0.6, 0.02, r"wheel moved 12.00 mm while servo 1 turned for 20.00 mm"),
     ],
 )
-def test_gear_beyond_trimming_is_reported(muxarm, share, move, reason):
+def test_gear_beyond_trimming_is_reported(muxarm, share, move, reason, monkeypatch):
+    monkeypatch.setattr("muxjax.hardware.transaction.MAX_TRIMS", 3)
     link = LockstepLink(muxarm)
     link.board.mechanics._metres_per_rad *= share
     run = execute(program(muxarm, [visit(muxarm, 1, [{1: move}])]), link)
@@ -383,7 +383,7 @@ def test_over_a_python_can_bus(muxarm):
         can.Bus("muxjax-test", interface="virtual") as host,
         can.Bus("muxjax-test", interface="virtual") as far,
     ):
-        thread = threading.Thread(target=serve, args=(board, far, done.is_set))
+        thread = threading.Thread(target=serve, args=(board, BusWire(far), done.is_set))
         thread.start()
         try:
             run = execute(

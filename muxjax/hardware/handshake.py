@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,7 +19,8 @@ from muxjax.scheduler import Program
 START_TOLERANCE_MM = 0.5  # how far the wheels may stand from program.start
 RESUME_TOLERANCE_MM = 2.0  # and from where the journal left them: clutches that dropped out slip
 TAKEOVER_S = 1.0  # the watchdog has disarmed a dead host's board by then
-READING_TRIES = 5  # of all turn counts: one that was lost on the way is off by a whole turn
+READING_TRIES = 12
+READING_S = 0.1  # for one frame of every stream, right after it began anew
 MIN_VOLTAGE_V = 18.0  # below this a 24 V servo has not its torque
 MAX_COIL_C = 100.0
 STALLED, OFFLINE = 4, 8  # bits of SERVO_FB.Status
@@ -129,26 +131,43 @@ class Handshake(Session):
         yield from self._expect(lambda: self.sensors.heartbeat_at >= greeted, "BOARD_HB")
 
     def _learn_turns(self, expected: Standing) -> Script[None]:
-        """Read every sensor; tell a board that lost its turn counts what they are."""
-        given = False
+        """Read every sensor; tell a board that lost its turn counts what they are.
+
+        What a wheel reports at the end of a turn, or is told there, can be off by a whole turn:
+        a frame was lost, or noise took the angle across in between. Then both begin anew.
+        """
+        lost = Fault.TURNS_LOST in self.sensors.faults
+        wheels = list(range(self.robot.n_tendons))
+        turn = COUNTS_PER_TURN * self.sensors.metres_per_count
         for _ in range(READING_TRIES):
-            if given or Fault.TURNS_LOST in self.sensors.faults:
-                yield from self._expect(lambda: self.sensors.angles_known, "every wheel's angle")
-                yield from self._give_turns(expected)
-                given = True
-            self.sensors.forget_turns()
-            # The streams begin anew, so that one of each message comes at once.
-            yield from self._command(Op.SET_STREAM, arg=self.stream_divider)
-            yield from self._expect(lambda: self.sensors.complete, self._silent_sensor)
+            if lost:
+                yield from self._read_anew(lambda: self.sensors.angles_known)
+                yield from self._give_turns(wheels, expected)
+            yield from self._read_anew(lambda: self.sensors.complete)
             off = _beyond(self.sensors.displacements(), expected)
-            if off.max() < COUNTS_PER_TURN / 4 * self.sensors.metres_per_count:
+            wheels = np.flatnonzero(off > turn / 4).tolist()
+            if not wheels:
                 return
 
-    def _give_turns(self, expected: Standing) -> Script[None]:
+    def _read_anew(self, condition: Callable[[], bool]) -> Script[None]:
+        """Let every stream begin anew, so that one of each message comes at once."""
+        for _ in range(READING_TRIES):
+            self.sensors.forget_turns()
+            yield from self._command(Op.SET_STREAM, arg=self.stream_divider)
+            if (yield from self._until(condition, READING_S)):
+                return
+        if self.sensors.unreadable:
+            wheel = min(self.sensors.unreadable) + 1
+            raise Failed(f"the encoder of wheel {wheel} flags every sample", After.REPAIR)
+        raise Failed(f"not every sensor reported in {READING_TRIES * READING_S:g} s")
+
+    def _give_turns(self, wheels: Iterable[int], expected: Standing) -> Script[None]:
+        """Say in which turn wheels stand (from 0): the one nearest to where they may be."""
         low, high = _interval(expected)
         last = np.array(expected.lengths, dtype=np.float64)
         count = self.sensors.metres_per_count
-        for wheel, angle in enumerate(self.sensors.angles()):
+        for wheel in wheels:
+            angle = self.sensors.angles()[wheel]
             middle = round((last[wheel] / count - angle) / COUNTS_PER_TURN)
             turns = np.arange(middle - 4, middle + 5)
             at = (turns * COUNTS_PER_TURN + angle) * count
@@ -156,14 +175,7 @@ class Handshake(Session):
             beyond = np.maximum(low[wheel] - at, at - high[wheel]).clip(min=0.0)
             best = np.lexsort((np.abs(at - last[wheel]), beyond))[0]
             arg = (wheel + 1) << 16 | (int(turns[best]) & 0xFFFF)
-            yield from self._command(Op.TURNS, arg=arg)
-
-    def _silent_sensor(self) -> str:
-        """What the board has not reported."""
-        if self.sensors.unreadable:
-            wheel = min(self.sensors.unreadable) + 1
-            return f"wheel {wheel}, whose encoder flags every sample"
-        return "every sensor to report"
+            yield from self._command(Op.TURNS, arg=arg, may=(Reason.TENDON_RANGE,))
 
     # The preflight report
 

@@ -14,7 +14,7 @@ from muxjax.hardware.visits import Visit, make_visit
 Targets = Mapping[int, int]  # {servo: 0.1 degree}
 
 ENGAGE_TRIES = 3
-MAX_TRIMS = 3
+MAX_TRIMS = 6  # each may be lost in the play of the gear
 TRIM_COUNTS = 1.5  # wheel error [encoder counts] that is left alone
 CLUTCH_S = 0.5  # after this a clutch or its probe should be done
 # A wheel further from where its servo has taken it than this has not followed: trims are for what

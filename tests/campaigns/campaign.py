@@ -7,12 +7,12 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from muxjax.hardware import LockstepLink, MemoryJournal, Run, execute, resume
+from muxjax.hardware import LockstepLink, MemoryJournal, Run
 from muxjax.hardware.faults import FaultKind
 from muxjax.hardware.protocol import BoardState, Frame
-from muxjax.pipeline import replan
+from muxjax.pipeline import run_to_target
 from muxjax.robot import Robot
-from muxjax.scheduler import Program, schedule, waypoints
+from muxjax.scheduler import Program, waypoints
 from tests.campaigns.judge import Judge
 from tests.campaigns.scenario import LASTING, Scenario
 
@@ -22,6 +22,7 @@ AGAIN_M = 1e-3  # way of a tendon beyond its program, each time that its clutch 
 RANGE_M = 1.2e-3  # slip at a clutch, and the encoder's error
 BOOT_S = 2.0
 COOLING_S = 300.0
+TO_WAIT_FOR = ("coils", "supply")  # refusals that pass
 
 
 class HostKilled(Exception):  # noqa: N818 - no error, an event
@@ -86,66 +87,60 @@ def run(robot: Robot, scenario: Scenario) -> Verdict:
     link.kills = scenario.kills
     judge = Judge(link.board, RANGE_M)
     verdict = Verdict(scenario.seed)
-    last = _host(robot, scenario, link, verdict)
+    last = _host(scenario, link, verdict)
     link.kills = ()
-    link.wait(link.now + 1.0)
+    _pass(link, 1.0)
     verdict.simulated_s = link.now
     verdict.offences += judge.offences.values()
     _judge_end(scenario, link, judge, last, verdict)
     return verdict
 
 
-def _host(robot: Robot, scenario: Scenario, link: MortalLink, verdict: Verdict) -> Run | None:
+def _host(scenario: Scenario, link: MortalLink, verdict: Verdict) -> Run | None:
     """Begin, and go on until it is done or nobody can: the last run, None if it was refused."""
-    journal, program = MemoryJournal(), scenario.program
-    target = np.array(program.target)
+    journal = MemoryJournal()
     last: Run | None = None
     for _ in range(RETURNS):
+        begun = journal.standing.program is not None
         try:
-            unfinished = journal.standing.program is not None
-            last = resume(journal, link) if unfinished else execute(program, link, journal=journal)
+            last = run_to_target(link, journal, None if begun else scenario.program)
         except HostKilled:
             verdict.steps.append(f"{link.now:.2f} s: host killed")
             _operator(link)
             continue
         except ValueError as refused:
             verdict.steps.append(f"{link.now:.2f} s: refused: {refused}")
-            verdict.reason = str(refused)
-            if "coils" not in verdict.reason:
+            verdict.reason, last = str(refused), None
+            if not str(refused).startswith(TO_WAIT_FOR):
                 return None
             _operator(link)
             continue
-        verdict.steps.append(f"{link.now:.2f} s: {last.reason}")
+        verdict.steps.append(f"{link.now:.2f} s: {last.reason}; failed {last.failed_servos}")
         verdict.reason = last.reason
-        if last.completed:
+        if last.completed or not last.resumable:
             return last
         _operator(link)
-        if last.failed_servos and not np.isnan(last.measured).any():
-            left = tuple(s for s in program.servos if s not in last.failed_servos)
-            if not left:
-                return last
-            rest = replan(robot, last, target, servos=left)
-            program, journal = schedule(robot, rest), MemoryJournal()
-            verdict.steps.append(f"planned anew for servos {left}")
-        elif not last.resumable:
-            return last
     return last
 
 
 def _operator(link: MortalLink) -> None:
     """Waits; switches a board off and on that is cut off for good or latched."""
-    link_kills, link.kills = link.kills, ()
-    link.wait(link.now + 0.5)
+    kills, link.kills = link.kills, ()
+    _pass(link, 0.5)
     board = link.board
-    latched = board.state is BoardState.ESTOPPED
-    if FaultKind.BUS_OFF in board.cut_off or latched:
+    if FaultKind.BUS_OFF in board.cut_off or board.state is BoardState.ESTOPPED:
         board.power_cycle()
-        link.wait(link.now + BOOT_S)
-    elif board.cut_off or not board.running or board.volts < board.physics.controller.lowest_v:
-        link.wait(link.now + BOOT_S)
+    _pass(link, BOOT_S)
     if board.coils.temperature > board.physics.coil.limit_c:
-        link.wait(link.now + COOLING_S)
-    link.kills = tuple(t for t in link_kills if t > link.now)
+        _pass(link, COOLING_S)
+    link.kills = tuple(t for t in kills if t > link.now)
+
+
+def _pass(link: MortalLink, seconds: float) -> None:
+    """Let time pass without a host."""
+    end = link.now + seconds
+    while link.now < end:
+        link.wait(end)
 
 
 def _judge_end(
@@ -154,7 +149,7 @@ def _judge_end(
     goals, board = np.array(scenario.program.target), link.board
     samples = []
     for _ in range(16):  # a fresh look with the sensors' noise averaged out
-        link.wait(link.now + 0.01)
+        _pass(link, 0.01)
         samples.append(board.senses.displacements())
     measured = np.mean(samples, axis=0)
     verdict.measured_mm = 1e3 * float(np.abs(measured - goals).max())

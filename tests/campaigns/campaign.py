@@ -14,7 +14,7 @@ from muxjax.pipeline import run_to_target
 from muxjax.robot import Robot
 from muxjax.scheduler import Program, waypoints
 from tests.campaigns.judge import Judge
-from tests.campaigns.scenario import LASTING, Scenario
+from tests.campaigns.scenario import Scenario
 
 END_M = 2e-5  # of measured wheel length
 RETURNS = 8  # how often the operator lets a run go on
@@ -166,13 +166,11 @@ def _judge_end(
         if verdict.measured_mm > 1e3 * END_M:
             verdict.offences.append(f"completed {verdict.measured_mm:.4f} mm off")
         return
-    words = [w for kind in scenario.lasting for w in LASTING[kind]]
-    if any(w in verdict.reason for w in words):
+    if any(word in verdict.reason for word in scenario.true_reasons):
         verdict.ending = "safe"
-    elif words:
-        verdict.offences.append(f"stopped for another reason than {scenario.lasting}")
     else:
-        verdict.offences.append("did not complete although nothing lasting was broken")
+        kinds = ", ".join(scenario.lasting) or "nothing lasting"
+        verdict.offences.append(f"did not complete, although {kinds} was broken")
 
 
 def _ways(robot: Robot, program: Program) -> np.ndarray:

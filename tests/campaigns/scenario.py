@@ -13,6 +13,8 @@ from muxjax.robot import Robot
 from muxjax.scheduler import Instruction, Program
 from muxjax.tendons import displacement_range, tendon_displacements
 
+# A clutch that slips once is over, but whoever sees a wheel stand still cannot know that.
+SLIPPED = ("WHEEL_STILL", "its wheel moved")
 # What ends by itself or by an operator's hand, and after how long at most [s].
 PASSING: dict[FaultKind, float] = {
     FaultKind.CLUTCH_SLIP: 0.0,
@@ -26,8 +28,8 @@ PASSING: dict[FaultKind, float] = {
 }
 # What lasts, and words of which a run that it ends must give one as its reason.
 LASTING: dict[FaultKind, tuple[str, ...]] = {
-    FaultKind.SERVO_STALL: ("SERVO_STALLED", "SERVO_OFFLINE"),
-    FaultKind.SERVO_OFFLINE: ("SERVO_OFFLINE", "SERVO_STALLED"),
+    FaultKind.SERVO_STALL: ("SERVO_STALLED", "SERVO_OFFLINE", "stalled or offline"),
+    FaultKind.SERVO_OFFLINE: ("SERVO_OFFLINE", "SERVO_STALLED", "stalled or offline"),
     FaultKind.CLUTCH_DEAD: ("seated",),
     FaultKind.CLUTCH_STUCK: ("NOT_RELEASED", "CLUTCH_IN"),
     FaultKind.ENCODER_STUCK: ("WHEEL_STILL", "seated", "encoder"),
@@ -64,6 +66,12 @@ class Scenario:
         """Kinds of faults that do not pass."""
         return tuple(f.kind for f in self.faults if f.for_s is None and f.kind in LASTING)
 
+    @property
+    def true_reasons(self) -> tuple[str, ...]:
+        """Words of which a run that stops for good must give one."""
+        slips = any(f.kind is FaultKind.CLUTCH_SLIP for f in self.faults)
+        return (*(w for kind in self.lasting for w in LASTING[kind]), *(SLIPPED if slips else ()))
+
 
 def draw(robot: Robot, seed: int) -> Scenario:
     """The scenario of a seed."""
@@ -97,7 +105,7 @@ def _draw_program(robot: Robot, rng: np.random.Generator, at_the_limit: bool) ->
     The latter are lengths of no configuration, so that nothing can be planned for them anew.
     """
     limits = displacement_range(robot)
-    theta = rng.uniform(0.0, 0.8, robot.n_segments) * robot.theta_max
+    theta = rng.uniform(0.0, 0.6, robot.n_segments) * robot.theta_max
     phi = rng.uniform(0.0, 2 * np.pi, robot.n_segments)
     start = np.array(tendon_displacements(robot, np.stack([theta, phi], axis=-1).ravel()))
     if at_the_limit:

@@ -206,7 +206,7 @@ class Handshake(Session):
                 f"{sensors.coil_temperature:.0f} degC, at most {MAX_COIL_C:g} degC",
             ),
             Check(
-                "INL table", True, f"none: true lengths within {inl_mm:.2f} mm of the measured ones"
+                "INL table", True, f"of the board; without one, lengths are true to {inl_mm:.2f} mm"
             ),
         )
 

@@ -166,6 +166,9 @@ class MemoryJournal:
         """How far the last program has come."""
         return standing(self.entries)
 
+    def close(self) -> None:
+        """Nothing more will be written."""
+
 
 class Journal(MemoryJournal):
     """A journal in a file.

@@ -7,6 +7,8 @@ time.
 
 from __future__ import annotations
 
+import json
+import logging
 import secrets
 import time
 from collections import Counter
@@ -189,6 +191,29 @@ class BusLink:
     def trajectory(self, since: float) -> None:
         """Nobody sees the truth of a real arm."""
         return
+
+
+def open_bus(spec: str) -> can.BusABC:
+    """A python-can bus, from the arguments of ``can.Bus`` or from python-can's configuration.
+
+    Args:
+        spec: A JSON object of arguments, such as ``{"interface": "socketcand", "host":
+            "127.0.0.1", "port": 29536, "channel": "can0"}``; or the name of a section of
+            python-can's configuration file.
+
+    Raises:
+        ValueError: Not JSON, no such section, or an interface that cannot be opened.
+    """
+    import can
+
+    # socketcand warns of every message that TCP has cut in two, though it mends that itself.
+    logging.getLogger("can").setLevel(logging.ERROR)
+    try:
+        if spec.lstrip().startswith("{"):
+            return can.Bus(**json.loads(spec))
+        return can.Bus(config_context=spec)
+    except (can.CanError, TypeError, ValueError) as error:
+        raise ValueError(f"bus: {spec} cannot be opened: {error}") from error
 
 
 def _bus_errors() -> tuple[type[Exception], ...]:

@@ -7,6 +7,7 @@ on a real bus between the two is not modelled here; TCP and a pty lose nothing.
 
 from __future__ import annotations
 
+import contextlib
 import os
 import select
 import socket
@@ -174,7 +175,7 @@ class SocketcandWire:
             return []
         frames = []
         for line in lines:
-            words = line.partition(b"<")[2].decode("ascii", "replace").split()
+            words = line.rpartition(b"<")[2].decode("ascii", "replace").split()
             frame = _sent_frame(words) if words[:1] == ["send"] else None
             if frame is not None and client.raw_from is not None:
                 frames.append(frame)
@@ -265,10 +266,8 @@ class SlcanWire:
         self._write(b"V1013\r" if line == b"V" else b"\r" if known else b"\a")
 
     def _write(self, data: bytes) -> None:
-        try:
+        with contextlib.suppress(BlockingIOError):
             os.write(self._master, data)
-        except BlockingIOError:
-            pass
 
 
 def _slcan_frame(line: bytes) -> Frame | None:

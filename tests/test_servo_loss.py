@@ -7,6 +7,7 @@ import dataclasses
 import numpy as np
 import pytest
 from test_executor import program, random_program, visit
+from test_resume import pass_time
 
 from muxjax.hardware import LockstepLink, MemoryJournal, execute, resume
 from muxjax.hardware.faults import FaultConfig
@@ -114,7 +115,7 @@ def test_bus_off_is_resumed_after_a_power_cycle(muxarm):
     assert (run.completed, run.resumable) == (False, True)
     assert "heartbeat is lost" in run.reason
     link.board.power_cycle()
-    link.wait(link.now + 2.0)
+    pass_time(link, 2.0)
     assert resume(journal, link).completed
     assert link.board.mechanics.displacements == pytest.approx(np.array(made.target), abs=END_M)
 

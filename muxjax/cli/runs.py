@@ -175,8 +175,8 @@ def on_bus(
         link = BusLink(opened, arm, stream_divider)
         begin_s = time.time() - link.now
         done = go_logged(link, log, begin_s, lambda logged: go(logged, tell))
-    for text, count in link.errors.items():
-        console.print(f"bus: {text}, {count} times")
+    for kind, count in link.errors.items():
+        console.print(f"bus: raised {kind} {count} times")
     return done
 
 

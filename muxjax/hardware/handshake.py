@@ -18,7 +18,7 @@ from muxjax.scheduler import Program
 
 START_TOLERANCE_MM = 0.5  # how far the wheels may stand from program.start
 RESUME_TOLERANCE_MM = 2.0  # and from where the journal left them: clutches that dropped out slip
-TAKEOVER_S = 1.0  # the watchdog has disarmed a dead host's board by then
+TAKEOVER_S = 1.0  # by then a board is up, and its watchdog has let go of a host that died
 READING_TRIES = 12
 READING_S = 0.1  # for one frame of every stream, right after it began anew
 MIN_VOLTAGE_V = 18.0  # below this a 24 V servo has not its torque
@@ -113,17 +113,24 @@ class Handshake(Session):
         )
 
     def _greet(self) -> Script[None]:
-        """HELLO as soon as the board's watchdog has let go of a host that died."""
+        """HELLO, as soon as the board is up or its watchdog has let go of a host that died."""
         deadline = self._now + TAKEOVER_S
+        hello = VERSION << 16 | self.session
         while True:
-            reason = yield from self._command(
-                Op.HELLO, arg=VERSION << 16 | self.session, may=(Reason.ARMED_ALREADY,)
-            )
-            if reason is Reason.NONE:
-                break
+            try:
+                reason = yield from self._command(Op.HELLO, arg=hello, may=(Reason.ARMED_ALREADY,))
+                if reason is Reason.NONE:
+                    break
+                trouble = Failed(
+                    "HELLO: the board is armed by another host that lives", After.RESUME
+                )
+                yield from self._pause(TAKEOVER_S / 20)
+            except Wrong:
+                raise
+            except Failed as failure:
+                trouble = failure
             if self._now >= deadline:
-                raise Failed("HELLO: the board is armed by another host that lives", After.RESUME)
-            yield from self._pause(TAKEOVER_S / 20)
+                raise trouble
         greeted = self._now
         for number, word in enumerate(fingerprint_words(self.program.fingerprint), start=1):
             yield from self._command(Op.ROBOT, number, word)

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from muxjax.hardware import LockstepLink, MemoryJournal, Run
+from muxjax.hardware.encoders import COUNTS_PER_RAD
 from muxjax.hardware.faults import FaultKind
 from muxjax.hardware.protocol import BoardState, Frame
 from muxjax.pipeline import run_to_target
@@ -117,9 +118,9 @@ def _host(scenario: Scenario, link: MortalLink, verdict: Verdict) -> Run | None:
             continue
         verdict.steps.append(f"{link.now:.2f} s: {last.reason}; failed {last.failed_servos}")
         verdict.reason = last.reason
-        if last.completed or not last.resumable:
+        if last.completed or (not last.resumable and scenario.lasting):
             return last
-        _operator(link)
+        _operator(link)  # who has repaired by then what does not last
     return last
 
 
@@ -150,8 +151,8 @@ def _judge_end(
     samples = []
     for _ in range(16):  # a fresh look with the sensors' noise averaged out
         _pass(link, 0.01)
-        samples.append(board.senses.displacements())
-    measured = np.mean(samples, axis=0)
+        samples.append([board.senses.raw(c) for c in range(len(goals))])  # turns never lost
+    measured = np.mean(samples, axis=0) / COUNTS_PER_RAD * float(board.robot.wheel_radius)
     verdict.measured_mm = 1e3 * float(np.abs(measured - goals).max())
     verdict.true_mm = 1e3 * float(np.abs(board.mechanics.displacements - goals).max())
     if not judge.at_rest and not board.mechanics.stuck_plugs:
@@ -166,7 +167,7 @@ def _judge_end(
         if verdict.measured_mm > 1e3 * END_M:
             verdict.offences.append(f"completed {verdict.measured_mm:.4f} mm off")
         return
-    if any(word in verdict.reason for word in scenario.true_reasons):
+    if scenario.lasting and any(word in verdict.reason for word in scenario.true_reasons):
         verdict.ending = "safe"
     else:
         kinds = ", ".join(scenario.lasting) or "nothing lasting"

@@ -13,10 +13,9 @@ from muxjax.robot import Robot
 from muxjax.scheduler import Instruction, Program
 from muxjax.tendons import displacement_range, tendon_displacements
 
-# A clutch that slips once is over, but whoever sees a wheel stand still cannot know that.
-SLIPPED = ("WHEEL_STILL", "its wheel moved")
 # What ends by itself or by an operator's hand, and after how long at most [s].
 PASSING: dict[FaultKind, float] = {
+    FaultKind.SERVO_STALL: 1.0,  # an overload: the host goes on without the servo all the same
     FaultKind.CLUTCH_SLIP: 0.0,
     FaultKind.ENCODER_PARITY: 1.0,
     FaultKind.COIL_HEAT: 3.0,
@@ -35,6 +34,11 @@ LASTING: dict[FaultKind, tuple[str, ...]] = {
     FaultKind.ENCODER_STUCK: ("WHEEL_STILL", "seated", "encoder"),
     FaultKind.ENCODER_PARITY: ("ENCODER_FAULT", "encoder"),
     FaultKind.ENCODER_MAGNET: ("ENCODER_FAULT", "encoder"),
+}
+# What is over when it is reported, but whoever reports it cannot know that: it is to be repaired.
+REPORTED: dict[FaultKind, tuple[str, ...]] = {
+    **LASTING,
+    FaultKind.CLUTCH_SLIP: ("WHEEL_STILL", "its wheel moved"),
 }
 TRIGGERS = ("AXIAL", "ENGAGE", "START", "RELEASE")
 
@@ -69,8 +73,8 @@ class Scenario:
     @property
     def true_reasons(self) -> tuple[str, ...]:
         """Words of which a run that stops for good must give one."""
-        slips = any(f.kind is FaultKind.CLUTCH_SLIP for f in self.faults)
-        return (*(w for kind in self.lasting for w in LASTING[kind]), *(SLIPPED if slips else ()))
+        kinds = {f.kind for f in self.faults if f.kind in REPORTED}
+        return tuple(word for kind in sorted(kinds) for word in REPORTED[kind])
 
 
 def draw(robot: Robot, seed: int) -> Scenario:

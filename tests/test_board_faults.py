@@ -235,6 +235,8 @@ def test_a_switch_changes_a_tendon_with_or_without_its_wheel(muxarm, seen):
     assert 0.4e-3 - 1e-9 <= abs(bench.truth[0]) <= 0.6e-3 + 1e-9
     assert bool(abs(mechanics.wheels[0]) > 0.3e-3) is seen
     assert not bench.truth[1:].any()
+    times, points = mechanics.trajectory(0.0)
+    assert not points[times < times[np.argmax(points[:, 0] != 0)], 0].any()  # a jump, no slope
     sensed = bench.board.senses.displacements()
     assert sensed == pytest.approx(mechanics.wheels, abs=COUNT_M)
 

@@ -7,10 +7,9 @@ import pytest
 from test_executor import MortalLink, program, random_program, visit
 
 from muxjax.hardware import LockstepLink, MemoryJournal, execute, resume
-from muxjax.hardware.executor import Executor
-from muxjax.hardware.journal import Journal, LegEntry, ProgramEntry
+from muxjax.hardware.executor import Executor, begin
+from muxjax.hardware.journal import Journal, LegEntry
 from muxjax.hardware.protocol import BoardState
-from muxjax.hardware.visits import load_visits
 from muxjax.robot import Robot
 from muxjax.scheduler import Program
 
@@ -20,8 +19,7 @@ PROBE_M = 2e-4  # there and back of one probe
 
 def begun(robot: Robot, made: Program) -> MemoryJournal:
     journal = MemoryJournal()
-    goals = tuple(tuple(dict(leg) for leg in v.legs) for v in load_visits(robot, made))
-    journal.write(ProgramEntry(program=made, goals=goals))
+    begin(robot, made, journal)
     return journal
 
 

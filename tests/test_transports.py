@@ -20,11 +20,10 @@ import yaml
 from test_executor import program, visit
 
 from muxjax.hardware import BusLink, Link, LockstepLink, MemoryJournal, execute, resume
-from muxjax.hardware.executor import Executor
-from muxjax.hardware.journal import Journal, LegEntry, ProgramEntry
+from muxjax.hardware.executor import Executor, begin
+from muxjax.hardware.journal import Journal, LegEntry
 from muxjax.hardware.links import open_bus
 from muxjax.hardware.log import LoggedLink
-from muxjax.hardware.visits import load_visits
 from muxjax.robot import Robot, load_robot
 from muxjax.scheduler import Program
 
@@ -160,8 +159,7 @@ def bench(request, tmp_path_factory):
 
 
 def begun(robot: Robot, made: Program, journal: MemoryJournal) -> MemoryJournal:
-    goals = tuple(tuple(dict(leg) for leg in v.legs) for v in load_visits(robot, made))
-    journal.write(ProgramEntry(program=made, goals=goals))
+    begin(robot, made, journal)
     return journal
 
 

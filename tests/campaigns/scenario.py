@@ -97,7 +97,7 @@ def draw(robot: Robot, seed: int) -> Scenario:
         physics=physics.model_copy(update={"bus": bus}),
         program=program,
         axial=int(rng.integers(1, 10)) if rng.random() < 0.5 else None,
-        faults=_draw_faults(robot, rng, lasting=not at_the_limit),
+        faults=_draw_faults(robot, rng, replanning=not at_the_limit),
         kills=tuple(kills.tolist()),
         stream_divider=int(rng.choice([2, 4, 10])),
     )
@@ -148,14 +148,17 @@ def _instruction(robot: Robot, axial: int, servos: np.ndarray, legs: np.ndarray)
     )
 
 
-def _draw_faults(robot: Robot, rng: np.random.Generator, lasting: bool) -> tuple[FaultConfig, ...]:
-    """None to two that pass, and, where it may be, in every third run one that lasts."""
+def _draw_faults(
+    robot: Robot, rng: np.random.Generator, replanning: bool
+) -> tuple[FaultConfig, ...]:
+    """None to two that pass, and, where one can plan anew, in every third run one that lasts."""
     faults = []
     for _ in range(int(rng.choice([0, 1, 1, 2]))):
-        kind = FaultKind(rng.choice([k.value for k in PASSING]))
+        kinds = [k.value for k in PASSING if replanning or k is not FaultKind.SERVO_STALL]
+        kind = FaultKind(rng.choice(kinds))
         for_s = float(rng.uniform(0.05, PASSING[kind])) if PASSING[kind] else None
         faults.append(_fault(robot, rng, kind, for_s))
-    if lasting and rng.random() < 1 / 3:
+    if replanning and rng.random() < 1 / 3:
         faults.append(_fault(robot, rng, FaultKind(rng.choice([k.value for k in LASTING])), None))
     return tuple(faults)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -43,12 +44,18 @@ class EncoderCalibration(Strict):
 
     def correct(self, counts: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
         """Readings [counts, whole turns included] without the error, not rounded."""
+        table, rise, first = self._table
+        at = (counts % COUNTS_PER_TURN) * (len(self.error_deg[0]) / COUNTS_PER_TURN)
+        low = at.astype(np.int64)
+        entry = first + low
+        return counts - (table[entry] + rise[entry] * (at - low))
+
+    @cached_property
+    def _table(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Errors and their rise to the next angle [counts], and where each wheel's begin."""
         table = np.array(self.error_deg) * (COUNTS_PER_TURN / 360)
-        at = (counts % COUNTS_PER_TURN) * (table.shape[1] / COUNTS_PER_TURN)
-        low = at.astype(int) % table.shape[1]
-        wheel, part = np.arange(len(table)), at - np.floor(at)
-        above = table[wheel, (low + 1) % table.shape[1]]
-        return counts - (table[wheel, low] * (1 - part) + above * part)
+        rise = np.roll(table, -1, axis=1) - table
+        return table.ravel(), rise.ravel(), np.arange(len(table)) * table.shape[1]
 
 
 def load_calibration(path: str | Path) -> EncoderCalibration:
@@ -108,15 +115,18 @@ class Encoders:
     def error(self, radians: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
         """Smooth error [counts] at true wheel angles [rad]."""
         first, second = self._phase
-        waves = np.stack([np.sin(radians + first), np.sin(2 * radians + second)])
-        error: Float[np.ndarray, " n"] = (self._amplitude * waves).sum(axis=0)
+        one, two = self._amplitude
+        error: Float[np.ndarray, " n"]
+        error = one * np.sin(radians + first) + two * np.sin(2 * radians + second)
         return error
 
-    def read(self, radians: Float[np.ndarray, " n"]) -> Int[np.ndarray, " n"]:
-        """A reading of every wheel [counts of 14 bits], as if it also counted whole turns."""
+    def seen(self, radians: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
+        """True wheel angles [rad] with the smooth error [counts, whole turns included]."""
         counts = radians * COUNTS_PER_RAD
-        if not self._exact:
-            counts = counts + self.error(radians)
+        return counts if self._exact else counts + self.error(radians)
+
+    def read(self, counts: Float[np.ndarray, " n"]) -> Int[np.ndarray, " n"]:
+        """A reading of wheels that are ``seen`` so [counts of 14 bits, whole turns included]."""
         if self._noise:
             counts = counts + self._next_noise()
         read = np.rint(counts / (1 << self._lost_bits)).astype(np.int64) << self._lost_bits
@@ -155,7 +165,7 @@ class Encoders:
             true = np.full(self._amplitude.shape[1], angle)
             for _ in range(3):
                 true = angle - self.error(true) / COUNTS_PER_RAD
-            table.append((self.read(true) / COUNTS_PER_RAD - true) * (180 / math.pi))
+            table.append((self.read(self.seen(true)) / COUNTS_PER_RAD - true) * (180 / math.pi))
         wheels = np.array(table).T
         rows = ((wheels + 180) % 360 - 180).tolist()
         return EncoderCalibration.model_validate({"schema": "muxjax/encoders/1", "error_deg": rows})

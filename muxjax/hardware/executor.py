@@ -325,6 +325,7 @@ class Executor(Transaction):
                 self._completed, self._reason = True, "completed"
                 break
             except Failed as caught:
+                self._guarded = False  # the stop that this one announces is no second failure
                 failure = yield from self._explain(caught)
                 failures.append(str(failure))
                 failures += yield from self._leave()

@@ -53,6 +53,7 @@ class Mechanics:
         self.time = 0.0
         self.displacements = np.array(displacements, dtype=np.float64)
         self.wheels = self.displacements.copy()
+        self.windings = 0  # how often a wheel has changed
         self.servo = np.zeros(robot.tendons_per_segment)
         self._slot_angle = 2 * math.pi / len(robot.axial_map)
         self._slots = len(robot.axial_map)
@@ -142,6 +143,7 @@ class Mechanics:
         self._wind(self.coupled[servo], way - held)
 
     def _wind(self, tendon: int, by: float) -> None:
+        self.windings += 1
         self.wheels[tendon] += by
         self.displacements[tendon] += by
 
@@ -263,6 +265,7 @@ class Mechanics:
 
     def _seat(self, pairs: Mapping[int, int]) -> None:
         clutch = self._physics.clutch
+        self._note()  # the record must jump here, not slope from its last point
         self.coupled.update(pairs)
         for servo, tendon in pairs.items():
             if self.coupled.get(servo) != tendon:
@@ -272,8 +275,7 @@ class Mechanics:
                 self._wind(tendon, self._slip(clutch.slip_seen_m))
             if clutch.slip_unseen_m:
                 self.displacements[tendon] += self._slip(clutch.slip_unseen_m)
-        if pairs:
-            self._note()
+        self._note()
 
     def _slip(self, about: float) -> float:
         return about * float(self._rng.uniform(0.8, 1.2) * self._rng.choice([-1, 1]))

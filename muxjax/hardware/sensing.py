@@ -38,13 +38,21 @@ class Senses:
         self._radius = float(robot.wheel_radius)
         self._missing = np.zeros(robot.n_tendons, dtype=np.int64)  # turns not counted [counts]
         self._bad = np.zeros(robot.n_tendons, dtype=np.int64)  # bad samples in a row
+        self._seen, self._windings = np.zeros(robot.n_tendons), -1
         self._good = self._read()
+        self._sampled_at = -math.inf
 
     def _read(self) -> Int[np.ndarray, " n"]:
-        return self.encoders.read(self._mechanics.wheels / self._radius) - self._missing
+        if self._windings != self._mechanics.windings:
+            self._seen = self.encoders.seen(self._mechanics.wheels / self._radius)
+            self._windings = self._mechanics.windings
+        return self.encoders.read(self._seen) - self._missing
 
     def wheel_counts(self) -> Int[np.ndarray, " n"]:
-        """A new sample of every wheel, whole turns included [counts of 14 bits]."""
+        """A sample of every wheel, whole turns included [counts of 14 bits]; one at a time."""
+        if self._sampled_at == self._mechanics.time:
+            return self._good
+        self._sampled_at = self._mechanics.time
         counts = self._read()
         if self.encoders.may_fail or self._bad.any():
             self.status = self.encoders.status()
@@ -73,7 +81,8 @@ class Senses:
         if not self.encoders.may_fail:
             return set()
         self.wheel_counts()
-        return set(np.flatnonzero(self._bad >= BAD_SAMPLES).tolist())
+        bad = self._bad >= BAD_SAMPLES
+        return set(np.flatnonzero(bad).tolist()) if bad.any() else set()
 
     def servo_bits(self) -> Int[np.ndarray, " J"]:
         """Shaft angles as the UART last heard them [0.1 degree]."""

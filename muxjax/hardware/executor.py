@@ -14,6 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
+from muxjax.hardware.codec import layouts
 from muxjax.hardware.handshake import OFFLINE, STALLED, Check
 from muxjax.hardware.journal import (
     AtEntry,
@@ -159,6 +160,7 @@ def resume(journal: MemoryJournal, link: Link, *, on_progress: OnProgress | None
 
 
 def _drive(link: Link, journal: MemoryJournal, on_progress: OnProgress | None) -> Run:
+    layouts()  # reading the DBC takes a moment: not once the first command is under way
     executor = Executor(link.robot, journal, link.new_session(), link.stream_divider)
     frames: list[Frame] = []
     told = -1

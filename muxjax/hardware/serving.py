@@ -15,6 +15,7 @@ import time
 from collections.abc import Callable, Iterable
 from typing import TYPE_CHECKING, Protocol
 
+from muxjax.hardware.codec import layouts
 from muxjax.hardware.links import receive_frames, send_frames
 from muxjax.hardware.protocol import DLC, Frame
 from muxjax.hardware.virtual_board import VirtualBoard
@@ -44,6 +45,7 @@ class Wire(Protocol):
 
 def serve(board: VirtualBoard, wire: Wire, until: Callable[[], bool]) -> None:
     """Be the board at the end of a wire, in real time, until ``until()`` says so."""
+    layouts()  # reading the DBC takes a moment, for which no host should have to wait
     begin = time.monotonic()
     while not until():
         now = time.monotonic() - begin

@@ -89,7 +89,7 @@ class Bench:
     def engage(self, axial: int = 1) -> Bench:
         """Armed, at an axial position, servo 1 coupled to the tendon it meets there."""
         self.arm().do(Op.AXIAL, arg=axial, takes=3.0)
-        self.do(Op.ENGAGE, *self.clutch(axial), takes=0.3)
+        self.do(Op.ENGAGE, *self.clutch(axial), takes=1.0)
         return self
 
     def clutch(self, axial: int) -> tuple[int, int]:
@@ -410,7 +410,7 @@ def test_no_valid_command_breaks_an_interlock(robot, seed):
 def test_visit_times_add_up_to_the_switch_time(robot):
     physics = load_physics("ideal")
     rest = physics.clutch_in_s + physics.clutch_out_s + 2 * probe_time(robot, physics)
-    assert axial_time(robot, physics) + rest == pytest.approx(float(robot.switch_time))
+    assert axial_time(robot, physics, 1.0) + rest == pytest.approx(float(robot.switch_time))
     slow = physics.model_copy(update={"clutch_in_s": 3.0})
     with pytest.raises(ValueError, match=r"must be below the robot's axial.switch_time_s of 3 s"):
         VirtualBoard(robot, slow)

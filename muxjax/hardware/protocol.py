@@ -50,6 +50,7 @@ class Op(IntEnum):
     STAGE = 8
     START = 9
     SET_STREAM = 10
+    TURNS = 11
 
 
 class Status(IntEnum):
@@ -94,6 +95,13 @@ class Reason(IntEnum):
     WATCHDOG = 25
     DISARMED = 26
     STREAM_RANGE = 27
+    TURNS_UNKNOWN = 28
+    SERVO_STALLED = 29
+    SERVO_OFFLINE = 30
+    ENCODER_FAULT = 31
+    COIL_HOT = 32
+    UNDERVOLTAGE = 33
+    WHEEL_STILL = 34
 
 
 class BoardState(IntEnum):
@@ -112,6 +120,11 @@ class Fault(IntFlag):
     WATCHDOG = 1
     ESTOP = 2
     FRAMES_REFUSED = 4
+    TURNS_LOST = 8
+    SERVO = 16
+    ENCODER = 32
+    COIL_HOT = 64
+    VOLTAGE = 128
 
 
 class Refusal(IntEnum):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -34,15 +35,22 @@ class MortalLink(LockstepLink):
     """A link whose host is killed at certain times.
 
     Attributes:
-        kills: Times left [s].
+        kills: Those left: when [s], and whether before the host sends (or else while it waits).
     """
 
-    kills: tuple[float, ...] = ()
+    kills: tuple[tuple[float, bool], ...] = ()
+
+    def send(self, frames: Iterable[Frame]) -> None:
+        """As ever, unless the host dies with the frames in its hands."""
+        if self.kills and self.kills[0][1] and self.now >= self.kills[0][0] and list(frames):
+            self.kills = self.kills[1:]
+            raise HostKilled
+        super().send(frames)
 
     def wait(self, until: float) -> list[Frame]:
         """As ever, unless the host does not live to see it."""
-        if self.kills and self.kills[0] <= until:
-            at, self.kills = self.kills[0], self.kills[1:]
+        if self.kills and not self.kills[0][1] and self.kills[0][0] <= until:
+            (at, _), self.kills = self.kills[0], self.kills[1:]
             super().wait(max(at, self.now))
             raise HostKilled
         return super().wait(until)
@@ -134,7 +142,7 @@ def _operator(link: MortalLink) -> None:
     _pass(link, BOOT_S)
     if board.coils.temperature > board.physics.coil.limit_c:
         _pass(link, COOLING_S)
-    link.kills = tuple(t for t in kills if t > link.now)
+    link.kills = tuple(kill for kill in kills if kill[0] > link.now)
 
 
 def _pass(link: MortalLink, seconds: float) -> None:

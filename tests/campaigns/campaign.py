@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import math
+import time
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 
 import numpy as np
 
+import muxjax
 from muxjax.hardware import LockstepLink, MemoryJournal, Run
 from muxjax.hardware.encoders import COUNTS_PER_RAD
 from muxjax.hardware.faults import FaultKind
@@ -16,7 +18,7 @@ from muxjax.pipeline import run_to_target
 from muxjax.robot import Robot
 from muxjax.scheduler import Program, waypoints
 from tests.campaigns.judge import Judge
-from tests.campaigns.scenario import Scenario
+from tests.campaigns.scenario import Scenario, draw
 
 END_M = 2e-5  # of measured wheel length
 RETURNS = 8  # how often the operator lets a run go on
@@ -185,3 +187,11 @@ def _judge_end(
 def _ways(robot: Robot, program: Program) -> np.ndarray:
     """How far each tendon goes in a program [m]."""
     return sum(np.abs(np.diff(points, axis=0)).sum(axis=0) for points in waypoints(robot, program))
+
+
+def play(seeds: Iterable[int]) -> tuple[list[Verdict], float]:
+    """Verdicts of some seeds, and the CPU time that they took [s]."""
+    robot = muxjax.load_robot("muxarm")
+    begin = time.process_time()
+    verdicts = [run(robot, draw(robot, seed)) for seed in seeds]
+    return verdicts, time.process_time() - begin

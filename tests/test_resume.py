@@ -140,8 +140,7 @@ def test_an_arm_that_was_moved_by_hand_is_refused(muxarm):
     link, journal = LockstepLink(muxarm), begun(muxarm, made)
     run_until(link, journal, 14.0)
     pass_time(link, 1.0)
-    link.board.mechanics.displacements[8] += 0.003
-    link.board.mechanics.wheels[8] += 0.003
+    link.board.mechanics._wind(8, 0.003)
     with pytest.raises(ValueError, match=r"lengths: tendon 9 stands 3.* from where the journal"):
         resume(journal, link)
 

@@ -151,7 +151,7 @@ def bench(request, tmp_path_factory):
         pytest.importorskip("serial")
     folder = tmp_path_factory.mktemp(request.param.__name__)
     values = load_robot("muxarm").config.model_dump(mode="json", by_alias=True)
-    values["axial"]["switch_time_s"]["value"] = 0.5
+    values["axial"]["switch_time_s"]["value"] = 0.4
     (folder / "quick.yaml").write_text(yaml.safe_dump(values))
     made = request.param(folder / "quick.yaml", folder)
     yield made
@@ -184,15 +184,14 @@ def go_on(journal: MemoryJournal, link: Link) -> Run:
     return run
 
 
-def there(bench, *tendons: int) -> Program:
-    """One visit that moves tendons 1 to 3 from where they are, and one for tendon 4."""
+def there(bench, visits: int = 1) -> Program:
+    """Tendons 1 to 3 from where they are, and tendon 4 in a second visit if there is one."""
     start = bench.truth()
     sign = -np.sign(start[0] - 1e-9)
     moves = {s: float(sign * STEP_M / s) for s in (1, 2, 3)}
     back = {1: float(-np.sign(start[3] - 1e-9) * STEP_M / 4)}
-    return program(
-        bench.robot, [visit(bench.robot, 1, [moves]), visit(bench.robot, 2, [back])], start
-    )
+    made = [visit(bench.robot, 1, [moves]), visit(bench.robot, 2, [back])]
+    return program(bench.robot, made[:visits], start)
 
 
 def arrived(bench, made: Program) -> bool:
@@ -201,7 +200,7 @@ def arrived(bench, made: Program) -> bool:
 
 def test_a_program_arrives_and_its_log_can_be_read(bench, tmp_path):
     can = pytest.importorskip("can")
-    made = there(bench)
+    made = there(bench, visits=2)
     with bench.link() as link:
         logged = LoggedLink(link, tmp_path / "run.log")
         journal = MemoryJournal()
@@ -306,6 +305,7 @@ def test_estop_stops_at_once_and_holds_until_power_up(bench):
     assert arrived(bench, made)
 
 
+@pytest.mark.slow
 def test_a_board_that_dies_is_missed_by_its_heartbeat(bench):
     if isinstance(bench, Lockstep):
         pytest.skip("a board in this process does not die")

@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import math
+import time
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 
 import numpy as np
 
+import muxjax
 from muxjax.hardware import LockstepLink, MemoryJournal, Run
 from muxjax.hardware.encoders import COUNTS_PER_RAD
 from muxjax.hardware.faults import FaultKind
@@ -15,7 +18,7 @@ from muxjax.pipeline import run_to_target
 from muxjax.robot import Robot
 from muxjax.scheduler import Program, waypoints
 from tests.campaigns.judge import Judge
-from tests.campaigns.scenario import Scenario
+from tests.campaigns.scenario import Scenario, draw
 
 END_M = 2e-5  # of measured wheel length
 RETURNS = 8  # how often the operator lets a run go on
@@ -34,15 +37,22 @@ class MortalLink(LockstepLink):
     """A link whose host is killed at certain times.
 
     Attributes:
-        kills: Times left [s].
+        kills: Those left: when [s], and whether before the host sends (or else while it waits).
     """
 
-    kills: tuple[float, ...] = ()
+    kills: tuple[tuple[float, bool], ...] = ()
+
+    def send(self, frames: Iterable[Frame]) -> None:
+        """As ever, unless the host dies with the frames in its hands."""
+        if self.kills and self.kills[0][1] and self.now >= self.kills[0][0] and list(frames):
+            self.kills = self.kills[1:]
+            raise HostKilled
+        super().send(frames)
 
     def wait(self, until: float) -> list[Frame]:
         """As ever, unless the host does not live to see it."""
-        if self.kills and self.kills[0] <= until:
-            at, self.kills = self.kills[0], self.kills[1:]
+        if self.kills and not self.kills[0][1] and self.kills[0][0] <= until:
+            (at, _), self.kills = self.kills[0], self.kills[1:]
             super().wait(max(at, self.now))
             raise HostKilled
         return super().wait(until)
@@ -134,7 +144,7 @@ def _operator(link: MortalLink) -> None:
     _pass(link, BOOT_S)
     if board.coils.temperature > board.physics.coil.limit_c:
         _pass(link, COOLING_S)
-    link.kills = tuple(t for t in kills if t > link.now)
+    link.kills = tuple(kill for kill in kills if kill[0] > link.now)
 
 
 def _pass(link: MortalLink, seconds: float) -> None:
@@ -177,3 +187,11 @@ def _judge_end(
 def _ways(robot: Robot, program: Program) -> np.ndarray:
     """How far each tendon goes in a program [m]."""
     return sum(np.abs(np.diff(points, axis=0)).sum(axis=0) for points in waypoints(robot, program))
+
+
+def play(seeds: Iterable[int]) -> tuple[list[Verdict], float]:
+    """Verdicts of some seeds, and the CPU time that they took [s]."""
+    robot = muxjax.load_robot("muxarm")
+    begin = time.process_time()
+    verdicts = [run(robot, draw(robot, seed)) for seed in seeds]
+    return verdicts, time.process_time() - begin

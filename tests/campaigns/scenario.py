@@ -53,7 +53,8 @@ class Scenario:
         program: What is to be run.
         axial: Axial position at power-up, from 1; None if unknown.
         faults: Of the board's parts.
-        kills: Times at which the host is killed [s].
+        kills: When the host is killed [s], and whether before it sends what it then decides (or
+            else while it waits).
         stream_divider: Of the feedback.
     """
 
@@ -62,7 +63,7 @@ class Scenario:
     program: Program
     axial: int | None
     faults: tuple[FaultConfig, ...]
-    kills: tuple[float, ...]
+    kills: tuple[tuple[float, bool], ...]
     stream_divider: int
 
     @property
@@ -92,14 +93,18 @@ def draw(robot: Robot, seed: int) -> Scenario:
     at_the_limit = rng.random() < 0.15
     program = _draw_program(robot, rng, at_the_limit)
     kills = np.cumsum(rng.uniform(0.0, 20.0, int(rng.choice([0, 0, 1, 2]))))
+    axial = int(rng.integers(1, 10)) if rng.random() < 0.5 else None
+    faults = _draw_faults(robot, rng, replanning=not at_the_limit)
+    divider = int(rng.choice([2, 4, 10]))
+    unsent = rng.random(len(kills)) < 0.5
     return Scenario(
         seed=seed,
         physics=physics.model_copy(update={"bus": bus}),
         program=program,
-        axial=int(rng.integers(1, 10)) if rng.random() < 0.5 else None,
-        faults=_draw_faults(robot, rng, replanning=not at_the_limit),
-        kills=tuple(kills.tolist()),
-        stream_divider=int(rng.choice([2, 4, 10])),
+        axial=axial,
+        faults=faults,
+        kills=tuple(zip(kills.tolist(), unsent.tolist(), strict=True)),
+        stream_divider=divider,
     )
 
 

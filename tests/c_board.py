@@ -62,7 +62,7 @@ def build(folder: Path, robot: Robot, extra: dict[str, str]) -> c.CDLL:
 
 
 class CFrame(c.Structure):
-    _fields_ = [("id", c.c_uint16), ("length", c.c_uint8), ("data", c.c_uint8 * 8)]  # noqa: RUF012
+    _fields_ = [("id", c.c_uint16), ("length", c.c_uint8), ("data", c.c_uint8 * 8)]
 
 
 _CALLS = {
@@ -85,7 +85,7 @@ _CALLS = {
 
 
 class Hal(c.Structure):
-    _fields_ = [("context", c.c_void_p), *_CALLS.items()]  # noqa: RUF012
+    _fields_ = [("context", c.c_void_p), *_CALLS.items()]
 
 
 class Plant:

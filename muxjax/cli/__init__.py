@@ -1,4 +1,6 @@
-"""The command line: ``muxjax bench | demo | fk | ik | plan | run | sweep | statics | task``.
+"""The command line.
+
+``muxjax bench | conformance | demo | firmware | fk | ik | plan | run | sweep | statics | task``
 
 A person types and reads millimetres and degrees; ``--json`` prints SI units for a machine. The exit
 code is 0 on success, 1 where a pose was not reached or a run did not complete, 2 on bad input.
@@ -18,6 +20,7 @@ import tyro
 
 from muxjax.cli.bench import bench
 from muxjax.cli.demo import demo
+from muxjax.cli.hardware import conformance, firmware
 from muxjax.cli.plans import plan, run
 from muxjax.cli.poses import fk, ik
 from muxjax.cli.statics import statics
@@ -28,7 +31,9 @@ from muxjax.planning import PlanningError
 
 COMMANDS: dict[str, Callable[..., Any]] = {
     "bench": bench,
+    "conformance": conformance,
     "demo": demo,
+    "firmware": firmware,
     "fk": fk,
     "ik": ik,
     "plan": plan,

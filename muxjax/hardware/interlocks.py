@@ -96,7 +96,7 @@ def known_axial(board: VirtualBoard, idx: int, arg: int) -> Refused | None:
 
 def clutches_out(board: VirtualBoard, idx: int, arg: int) -> Refused | None:
     """The axial motor would shear a plug that is in."""
-    held = board.energised | board.verified | set(board.mechanics.coupled.values())
+    held = board.energised | board.verified
     return (Reason.CLUTCH_IN, len(held)) if held else None
 
 

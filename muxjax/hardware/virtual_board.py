@@ -270,8 +270,9 @@ class VirtualBoard:
             self.mechanics.brake(self.physics.brake_s)
             yield self.physics.brake_s
         self.axial_turning = False
+        may_be_in = bool(self.energised | self.verified)  # a plug is not seen, only its coil
         self.energised.clear()
-        if self.mechanics.coupled:
+        if may_be_in:
             yield self.physics.clutch_out_s
         self.mechanics.coupled.clear()
         self.verified.clear()
@@ -299,7 +300,7 @@ class VirtualBoard:
     def _disarm(self, idx: int, arg: int) -> Job | None:
         self.state = BoardState.READY
         self.words_matched.clear()
-        if self._job is None and not self.energised and not self.mechanics.coupled:
+        if self._job is None and not self.energised | self.verified:
             return None
         self._abort_job(Reason.DISARMED)
         return self._come_to_rest()

@@ -1,9 +1,9 @@
 """C source for the authors of a board's firmware.
 
-``write_firmware`` puts into one folder: pack and unpack of every message (cantools' generator, from
-``protocol.dbc``), the protocol's values as C enumerations, one robot's constants, and the
-hand-written CRC (``e2e``) and state machine (``board``) that lie beside this file. docs/real_board.md
-says how they go together.
+``write_firmware`` puts into one folder: pack and unpack of every message (cantools' generator,
+from ``protocol.dbc``), the protocol's values as C enumerations, one robot's constants, and the
+hand-written CRC (``e2e``) and state machine (``board``) that lie beside this file.
+docs/real_board.md says how they go together.
 """
 
 from __future__ import annotations
@@ -13,6 +13,8 @@ import re
 import shutil
 from collections.abc import Iterable, Mapping
 from pathlib import Path
+
+import numpy as np
 
 from muxjax.hardware import protocol
 from muxjax.hardware.codec import database
@@ -87,8 +89,8 @@ def values_header() -> str:
     """Enumerations and limits of the protocol."""
     lines = [NOTE, "#ifndef TDMA_VALUES_H", "#define TDMA_VALUES_H", ""]
     for name, message, signal in TABLES:
-        choices = database().get_message_by_name(message).get_signal_by_name(signal).choices or {}
-        lines += _enum(name, {str(label): number for number, label in choices.items()})
+        choices = database().get_message_by_name(message).get_signal_by_name(signal).choices
+        lines += _enum(name, {str(label): int(number) for number, label in choices.items()})
     for name, members in (("fault", protocol.Fault), ("refusal", protocol.Refusal)):
         lines += _enum(name, {str(member.name): int(member) for member in members})
     lines += [f"#define TDMA_{name} {value}" for name, value in _limits().items()]
@@ -120,7 +122,7 @@ def _limits() -> dict[str, int]:
 
 def config_source(robot: Robot, physics: PhysicsConfig) -> str:
     """The constants of one robot's board, as ``board.h`` declares them."""
-    limits = displacement_range(robot) + [-RANGE_MARGIN_M, RANGE_MARGIN_M]
+    limits = displacement_range(robot) + np.array([-RANGE_MARGIN_M, RANGE_MARGIN_M])
     words = protocol.fingerprint_words(robot.fingerprint)
     probe = round(math.radians(physics.probe_angle_deg) * protocol.SERVO_BITS_PER_RAD)
     seconds = {

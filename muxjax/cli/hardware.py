@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import json as json_module
+from collections.abc import Iterator
 from pathlib import Path
 
 from muxjax.cli.output import console, print_json
-from muxjax.hardware import BusLink, LockstepLink, load_physics
+from muxjax.hardware import BusLink, Link, LockstepLink, load_physics
 from muxjax.hardware.conformance import Finding, run_checks
 from muxjax.hardware.firmware import write_firmware
-from muxjax.robot import load_robot
+from muxjax.robot import Robot, load_robot
 
 
 def firmware(out: Path, robot: str = "muxarm", physics: str = "ideal", json: bool = False) -> int:
@@ -56,15 +58,15 @@ def conformance(
         json: Print the findings as JSON.
     """
     arm = load_robot(robot)
-    options = {"allow_motion": allow_motion, "just_powered": just_powered, "only": only}
     on_finding = None if json else _print_finding
-    if bus is None:
-        findings = run_checks(LockstepLink(arm), on_finding=on_finding, **options)
-    else:
-        import can
-
-        with can.Bus(**json_module.loads(bus)) as opened:
-            findings = run_checks(BusLink(opened, arm), on_finding=on_finding, **options)
+    with _open(bus, arm) as link:
+        findings = run_checks(
+            link,
+            allow_motion=allow_motion,
+            just_powered=just_powered,
+            only=only,
+            on_finding=on_finding,
+        )
     failed = sum(finding.verdict == "fail" for finding in findings)
     if json:
         print_json({"findings": [dataclasses.asdict(finding) for finding in findings]})
@@ -78,3 +80,15 @@ def conformance(
 
 def _print_finding(finding: Finding) -> None:
     console.print(f"{finding.verdict:8} {finding.name}  {finding.reason}".rstrip(), soft_wrap=True)
+
+
+@contextlib.contextmanager
+def _open(bus: str | None, arm: Robot) -> Iterator[Link]:
+    """The link that --bus asks for."""
+    if bus is None:
+        yield LockstepLink(arm)
+        return
+    import can
+
+    with can.Bus(**json_module.loads(bus)) as opened:
+        yield BusLink(opened, arm)

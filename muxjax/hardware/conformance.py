@@ -171,9 +171,11 @@ class Bench:
                 self.sensors.update(self.link.now, received.name, received.values)
 
     def send(self, *frames: Frame) -> None:
+        """Put frames on the bus."""
         self.link.send(frames)
 
     def beat(self, session: int | None = None, watchdog_ms: int = 150) -> None:
+        """Send one HOST_HB."""
         session = self.session if session is None else session
         self.send(self.port.pack("HOST_HB", Armed=1, Session=session, Watchdog=watchdog_ms))
 
@@ -233,13 +235,16 @@ class Bench:
     # Ways to a state
 
     def greet(self) -> None:
+        """To READY."""
         self.do(Op.HELLO, arg=VERSION << 16 | self.session)
 
     def check_robot(self) -> None:
+        """Send the four words of the robot's hash."""
         for k, word in enumerate(fingerprint_words(self.robot.fingerprint), start=1):
             self.do(Op.ROBOT, k, word)
 
     def arm(self) -> None:
+        """To ARMED, with heartbeats from now on."""
         self.greet()
         self.check_robot()
         self.beating = True
@@ -248,6 +253,7 @@ class Bench:
         self.wait(2 * BOARD_BEAT_S + 0.5, lambda: self.sensors.complete)
 
     def go_to(self, position: int) -> None:
+        """Turn the axial motor, from 1."""
         self.do(Op.AXIAL, arg=position, within=2 * float(self.robot.switch_time))
 
     def engage(self, position: int = 1, servo: int = 1) -> int:
@@ -297,6 +303,7 @@ class Bench:
 
     @property
     def faults(self) -> Fault:
+        """Of the last BOARD_HB."""
         last = next((h for _, h in reversed(self.heard) if h.name == "BOARD_HB"), None)
         return Fault(0) if last is None else Fault(last.values["Faults"])
 
@@ -307,10 +314,12 @@ class Bench:
         return None if last is None else last.values["Refused"]
 
     def counts(self) -> np.ndarray:
+        """Wheels, whole turns included, heard anew."""
         self.listen()
         return np.rint(self.sensors.displacements() / self.sensors.metres_per_count)
 
     def servo_bits(self, servo: int) -> int:
+        """A servo's angle [0.1 degree], heard anew; servos from 1."""
         self.listen()
         return round(float(self.sensors.servo_rad[servo - 1]) * SERVO_BITS_PER_RAD)
 
@@ -327,10 +336,12 @@ class Bench:
         return WAY_M if self.sensors.displacements()[tendon] < (low + high) / 2 else -WAY_M
 
     def expect(self, kept: bool, what: str) -> None:
+        """Raise Broken unless a promise is kept."""
         if not kept:
             raise Broken(what)
 
     def stays(self, before: np.ndarray, what: str) -> None:
+        """No wheel has moved since ``before`` [counts]."""
         moved = np.abs(self.counts() - before).max()
         self.expect(moved <= STILL_COUNTS, f"{what}: a wheel moved {moved:.0f} counts")
 

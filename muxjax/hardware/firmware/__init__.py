@@ -89,7 +89,8 @@ def values_header() -> str:
     """Enumerations and limits of the protocol."""
     lines = [NOTE, "#ifndef TDMA_VALUES_H", "#define TDMA_VALUES_H", ""]
     for name, message, signal in TABLES:
-        choices = database().get_message_by_name(message).get_signal_by_name(signal).choices
+        described = database().get_message_by_name(message).get_signal_by_name(signal)
+        choices: Mapping[int, object] = described.choices or {}
         lines += _enum(name, {str(label): int(number) for number, label in choices.items()})
     for name, members in (("fault", protocol.Fault), ("refusal", protocol.Refusal)):
         lines += _enum(name, {str(member.name): int(member) for member in members})

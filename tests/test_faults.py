@@ -47,7 +47,7 @@ def test_a_servo_dies_between_two_instructions_and_the_rest_arrive(muxarm, targe
     kill(link, dead, after=1)
     run = muxjax.execute(first, link)
     assert not run.completed
-    assert "not seated" in run.reason
+    assert "SERVO_STALLED" in run.reason
     assert len(run.records) == 1
     left = tuple(s for s in (1, 2, 3) if s != dead)
     rest = replan(muxarm, run, target, servos=left)

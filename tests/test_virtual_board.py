@@ -410,7 +410,7 @@ def test_no_valid_command_breaks_an_interlock(robot, seed):
 def test_visit_times_add_up_to_the_switch_time(robot):
     physics = load_physics("ideal")
     rest = physics.clutch_in_s + physics.clutch_out_s + 2 * probe_time(robot, physics)
-    assert axial_time(robot, physics) + rest == pytest.approx(float(robot.switch_time))
+    assert axial_time(robot, physics, 1.0) + rest == pytest.approx(float(robot.switch_time))
     slow = physics.model_copy(update={"clutch_in_s": 3.0})
     with pytest.raises(ValueError, match=r"must be below the robot's axial.switch_time_s of 3 s"):
         VirtualBoard(robot, slow)

@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
+from muxjax.hardware.commands import turns_of
 from muxjax.hardware.protocol import (
     MAX_DIVIDER,
     SERVO_BITS_PER_RAD,
@@ -85,7 +86,40 @@ def robot_checked(board: VirtualBoard, idx: int, arg: int) -> Refused | None:
 
 def host_alive(board: VirtualBoard, idx: int, arg: int) -> Refused | None:
     """No arming without a heartbeat."""
-    return None if board.mechanics.time < board.watchdog_due else (Reason.NO_HEARTBEAT, 0)
+    return None if board.now < board.watchdog_due else (Reason.NO_HEARTBEAT, 0)
+
+
+def turns_known(board: VirtualBoard, idx: int, arg: int) -> Refused | None:
+    """No arming while a reset's lost turns were not told: every range check would be blind."""
+    unknown = board.senses.unknown
+    return (Reason.TURNS_UNKNOWN, min(unknown) + 1) if unknown else None
+
+
+def supply_good(board: VirtualBoard, idx: int, arg: int) -> Refused | None:
+    """No arming on a sagging supply; the board's value is in 0.01 V."""
+    low = board.volts < board.physics.controller.lowest_v
+    return (Reason.UNDERVOLTAGE, round(100 * board.volts)) if low else None
+
+
+def coils_cool(board: VirtualBoard, idx: int, arg: int) -> Refused | None:
+    """No arming with hot coils; the board's value is in degrees Celsius."""
+    hot = board.coils.temperature > board.physics.coil.limit_c
+    return (Reason.COIL_HOT, round(board.coils.temperature)) if hot else None
+
+
+def turns_fit(board: VirtualBoard, idx: int, arg: int) -> Refused | None:
+    """A wheel that exists, whose turns were lost, and a length within its range.
+
+    For a wheel whose turns the board itself has counted, only its own number is taken.
+    """
+    wheel, whole = turns_of(arg)
+    if not 0 <= wheel < board.robot.n_tendons:
+        return Reason.TURNS_UNKNOWN, board.robot.n_tendons
+    if not board.senses.agrees(wheel, whole):
+        return Reason.TURNS_UNKNOWN, wheel + 1
+    low, high = board.limits[wheel]
+    length = board.senses.length_with(wheel, whole)
+    return None if low <= length <= high else (Reason.TENDON_RANGE, wheel + 1)
 
 
 def known_axial(board: VirtualBoard, idx: int, arg: int) -> Refused | None:
@@ -107,7 +141,7 @@ def axial_still(board: VirtualBoard, idx: int, arg: int) -> Refused | None:
 
 def in_slot(board: VirtualBoard, idx: int, arg: int) -> Refused | None:
     """Clutches meet their servos only at an axial position."""
-    return (Reason.NOT_IN_SLOT, 0) if board.mechanics.slot < 0 else None
+    return (Reason.NOT_IN_SLOT, 0) if board.slot < 0 else None
 
 
 def present_layer(board: VirtualBoard, idx: int, arg: int) -> Refused | None:
@@ -175,8 +209,8 @@ def _beyond_range(board: VirtualBoard, servo: int, target: float) -> Refused | N
     tendon = board.tendon_of(servo)
     if tendon is None:
         return Reason.NOT_COUPLED, servo + 1
-    sensed = board.mechanics.servo_bits()[servo] / SERVO_BITS_PER_RAD
-    end = board.sensed_displacements()[tendon] + (target - sensed) / float(
+    sensed = board.senses.servo_bits()[servo] / SERVO_BITS_PER_RAD
+    end = board.senses.displacements()[tendon] + (target - sensed) / float(
         board.robot.servo_per_metre
     )
     low, high = board.limits[tendon]
@@ -188,7 +222,19 @@ MOVING: tuple[Check, ...] = (not_estopped, armed)
 CHECKS: dict[Op, tuple[Check, ...]] = {
     Op.HELLO: (not_estopped, not_armed, same_version, idle),
     Op.ROBOT: (not_estopped, greeted, same_robot),
-    Op.ARM: (not_estopped, not_armed, greeted, same_session, robot_checked, host_alive, idle),
+    Op.ARM: (
+        not_estopped,
+        not_armed,
+        greeted,
+        same_session,
+        robot_checked,
+        turns_known,
+        supply_good,
+        coils_cool,
+        host_alive,
+        idle,
+    ),
+    Op.TURNS: (not_estopped, not_armed, greeted, turns_fit),
     Op.DISARM: (not_estopped, armed),
     Op.AXIAL: (*MOVING, known_axial, clutches_out, idle),
     Op.ENGAGE: (*MOVING, axial_still, in_slot, present_layer, known_clutches, idle),

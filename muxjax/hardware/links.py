@@ -7,16 +7,16 @@ time; ``serve`` is the virtual board at the other end of such a bus.
 
 from __future__ import annotations
 
-import math
 import secrets
 import time
-from collections import deque
 from collections.abc import Callable, Collection, Iterable
 from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 from jaxtyping import Float
 
+from muxjax.hardware.bus import Bus
+from muxjax.hardware.faults import FaultConfig
 from muxjax.hardware.physics import PhysicsConfig
 from muxjax.hardware.protocol import MAX_DIVIDER, Frame
 from muxjax.hardware.virtual_board import VirtualBoard
@@ -61,10 +61,12 @@ class LockstepLink:
         axial: Axial position at power-up, from 1; between two if None.
         stream_divider: The board's feedback comes at 1 / this of its full rates (1 to 20); fewer
             frames to code make the same run faster.
+        faults: Faults beyond those of the physics.
+        seed: Of everything that is drawn on the board and on the bus.
 
     Attributes:
         board: The board; ``board.mechanics`` is the truth.
-        frames: Frames carried so far, both ways.
+        bus: The wire in between.
     """
 
     def __init__(
@@ -74,16 +76,17 @@ class LockstepLink:
         displacements: Collection[float] | Float[np.ndarray, " S*J"] | None = None,
         axial: int | None = None,
         stream_divider: int = 1,
+        faults: Iterable[FaultConfig] = (),
+        seed: int = 0,
     ) -> None:
         self.robot = robot
         self.stream_divider = check_divider(stream_divider)
-        self.board = VirtualBoard(robot, physics, displacements, axial)
-        self.frames = 0
+        self.board = VirtualBoard(robot, physics, displacements, axial, faults, seed)
+        physics = self.board.physics
+        on_the_wire = np.random.default_rng([seed, 1])
+        self.bus = Bus(physics.bus, physics.frame_latency_s, on_the_wire)
         self._now = 0.0
         self._sessions = 0
-        self._latency = self.board.physics.frame_latency_s
-        self._to_board: deque[tuple[float, list[Frame]]] = deque()  # arrival [s], frames
-        self._to_host: deque[tuple[float, list[Frame]]] = deque()
 
     @property
     def now(self) -> float:
@@ -96,26 +99,26 @@ class LockstepLink:
         return self._sessions
 
     def send(self, frames: Iterable[Frame]) -> None:
-        """Frames reach the board after the frame latency."""
-        self._carry(self._to_board, list(frames))
+        """Frames reach the board as the bus carries them."""
+        self.bus.send(self._now, True, frames)
 
     def wait(self, until: float) -> list[Frame]:
         """Let virtual time pass, from event to event."""
         while True:
-            due = min(_arrival(self._to_board), _arrival(self._to_host), self.board.next_time)
+            due = min(self.bus.next_time, self.board.next_time)
             if until < due:
                 self._now = max(self._now, until)
                 return []
             self._now = max(self._now, due)
-            arrived = _take(self._to_board, self._now)
-            self._carry(self._to_host, self.board.step(self._now, arrived))
-            if received := _take(self._to_host, self._now):
+            arrived, received = self.bus.take(self._now)
+            self.bus.send(self._now, False, self.board.step(self._now, arrived))
+            if received:
                 return received
 
-    def _carry(self, queue: deque[tuple[float, list[Frame]]], frames: list[Frame]) -> None:
-        if frames:
-            queue.append((self._now + self._latency, frames))
-            self.frames += len(frames)
+    @property
+    def frames(self) -> int:
+        """Frames sent so far, both ways."""
+        return self.bus.frames
 
     def trajectory(self, since: float) -> Trajectory:
         """The board's own record."""
@@ -128,17 +131,6 @@ def check_divider(stream_divider: int) -> int:
     if not 1 <= stream_divider <= MAX_DIVIDER:
         raise ValueError(f"stream_divider: is 1 to {MAX_DIVIDER}, found {stream_divider}")
     return stream_divider
-
-
-def _arrival(queue: deque[tuple[float, list[Frame]]]) -> float:
-    return queue[0][0] if queue else math.inf
-
-
-def _take(queue: deque[tuple[float, list[Frame]]], now: float) -> list[Frame]:
-    frames: list[Frame] = []
-    while queue and queue[0][0] <= now:
-        frames += queue.popleft()[1]
-    return frames
 
 
 class BusLink:

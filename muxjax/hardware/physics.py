@@ -1,27 +1,86 @@
-"""The truth behind the virtual board: servos, clutches, axial motor and winding wheels.
+"""Physics of a virtual board as a file in configs/hardware states it.
 
-The board's controller reads this through sensors only (``wheel_counts``, ``servo_bits``); the
-displacements and their record are for plots and judges.
+A section that is left out is ideal: no inertia, no backlash, no errors, no faults.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Literal
 
-import numpy as np
-from jaxtyping import Float, Int
 from pydantic import Field
 
 from muxjax.config import NotNegative, Positive, Strict, load_yaml, resolve
-from muxjax.hardware.protocol import COUNTS_PER_TURN, SERVO_BITS_PER_RAD, WHEEL_BITS
+from muxjax.hardware.bus import BusConfig
+from muxjax.hardware.faults import FaultConfig
+from muxjax.hardware.motion import fastest
 from muxjax.robot import Robot
+
+Share = Annotated[float, Field(ge=0, le=1)]
+
+
+class ServoPhysics(Strict):
+    """The servos behind the controller's UART."""
+
+    acceleration_rad_s2: Positive | None = Field(None, description="at the shaft; None: at once")
+    uart_period_s: Annotated[float, Field(ge=0, le=0.03)] = Field(
+        0.0, description="every servo is told and asked once in this time"
+    )
+    backlash_m: NotNegative = Field(0.0, description="of the gear, as tendon displacement")
+
+
+class AxialPhysics(Strict):
+    """The axial motor, where its time is not simply what t_sw leaves."""
+
+    speed_deg_s: Positive
+    acceleration_deg_s2: Positive
+
+
+class ClutchPhysics(Strict):
+    """Plugs and slots."""
+
+    slot_pitch_deg: Positive = Field(360.0, description="between slots, at the servo's shaft")
+    slot_window_deg: Positive = Field(360.0, description="a plug within it drops in")
+    miss_rate: Share = Field(0.0, description="of passing a window without dropping in")
+    slip_seen_m: NotNegative = Field(0.0, description="tendon change of a switch, wheel turns too")
+    slip_unseen_m: NotNegative = Field(0.0, description="the same beyond the wheel")
+
+
+class EncoderPhysics(Strict):
+    """The wheels' encoders."""
+
+    inl_deg: NotNegative = Field(0.0, description="largest smooth error over a turn")
+    noise_counts: NotNegative = Field(0.0, description="standard deviation of a reading")
+    parity_rate: Share = Field(0.0, description="of readings with a parity error")
+    calibration_points: Annotated[int, Field(ge=0, le=1024)] = Field(
+        0, description="angles of a turn at which the lab measured the error; 0: not calibrated"
+    )
+
+
+class CoilPhysics(Strict):
+    """Heat of the clutches' coils; M III-B2 says about 40 degC."""
+
+    ambient_c: float = 25.0
+    rise_k: NotNegative = Field(5.0, description="of each energised coil in the end")
+    time_constant_s: Positive = 120.0
+    limit_c: float = Field(80.0, description="above it the board stops")
+
+
+class ControllerPhysics(Strict):
+    """What happens when the controller does not run."""
+
+    horizon_s: Annotated[float, Field(gt=0, le=0.05)] = Field(
+        0.03, description="how far ahead of now a servo's target lies at most"
+    )
+    hardware_watchdog_s: Annotated[float, Field(gt=0, le=0.2)] = 0.1
+    boot_s: NotNegative = 0.3
+    brown_out_v: NotNegative = Field(9.0, description="below it the controller resets")
+    lowest_v: NotNegative = Field(18.0, description="below it an armed board stops")
 
 
 class PhysicsConfig(Strict):
-    """Physics of a virtual board, as a file in configs/hardware states it."""
+    """Physics and faults of a virtual board and its bus."""
 
     file_schema: Literal["muxjax/hardware/1"] = Field(alias="schema")
     clutch_in_s: NotNegative
@@ -30,6 +89,14 @@ class PhysicsConfig(Strict):
     brake_s: Annotated[float, Field(ge=0, le=0.05)]
     supply_v: Annotated[float, Field(gt=0, le=60)]
     frame_latency_s: Positive
+    servo: ServoPhysics = ServoPhysics()
+    axial: AxialPhysics | None = None
+    clutch: ClutchPhysics = ClutchPhysics()
+    encoder: EncoderPhysics = EncoderPhysics()
+    coil: CoilPhysics = CoilPhysics()
+    controller: ControllerPhysics = ControllerPhysics()
+    bus: BusConfig = BusConfig()
+    faults: tuple[FaultConfig, ...] = ()
 
 
 def load_physics(name_or_path: str | Path) -> PhysicsConfig:
@@ -41,17 +108,28 @@ def load_physics(name_or_path: str | Path) -> PhysicsConfig:
     return load_yaml(PhysicsConfig, resolve(name_or_path, "hardware"))
 
 
+def move_time(robot: Robot, physics: PhysicsConfig, way: float) -> float:
+    """Shortest time [s] in which a servo turns by ``way`` [rad]."""
+    return fastest(way, float(robot.servo_speed), physics.servo.acceleration_rad_s2)
+
+
 def probe_time(robot: Robot, physics: PhysicsConfig) -> float:
     """Duration [s] of the servo's oscillation out and back at full speed."""
-    return 2 * math.radians(physics.probe_angle_deg) / float(robot.servo_speed)
+    return 2 * move_time(robot, physics, math.radians(physics.probe_angle_deg))
 
 
-def axial_time(robot: Robot, physics: PhysicsConfig) -> float:
-    """Time [s] the axial motor has, so that a visit's switching adds up to t_sw (M Eq. 14).
+def axial_time(robot: Robot, physics: PhysicsConfig, way: float) -> float:
+    """Time [s] in which the axial motor turns by ``way`` [rad].
+
+    Without physics of its own, whatever the way, the time that makes a visit's switching add up
+    to t_sw (M Eq. 14).
 
     Raises:
         ValueError: Clutches and probes alone already take longer than t_sw.
     """
+    if physics.axial is not None:
+        limits = physics.axial.speed_deg_s, physics.axial.acceleration_deg_s2
+        return fastest(way, *map(math.radians, limits))
     rest = physics.clutch_in_s + physics.clutch_out_s + 2 * probe_time(robot, physics)
     left = float(robot.switch_time) - rest
     if left <= 0:
@@ -60,109 +138,3 @@ def axial_time(robot: Robot, physics: PhysicsConfig) -> float:
             f"robot's axial.switch_time_s of {float(robot.switch_time):.3g} s"
         )
     return left
-
-
-class Mechanics:
-    """State of the moving parts on a clock that only goes forward.
-
-    All motion is at constant speed, so the recorded break points are the whole trajectory.
-    Servos, tendons and slots count from 0 in here; slot -1 is between two slots.
-    """
-
-    def __init__(
-        self, robot: Robot, displacements: Float[np.ndarray, " S*J"], slot: int = -1
-    ) -> None:
-        self.time = 0.0
-        self.displacements = np.array(displacements, dtype=np.float64)  # true ones [m]
-        self.servo = np.zeros(robot.tendons_per_segment)  # shaft angle [rad]
-        self.slot = slot
-        self._slot_angle = 2 * math.pi / len(robot.axial_map)
-        self.axial = self._slot_angle * max(slot, 0)  # [rad]
-        self.coupled: dict[int, int] = {}  # servo: tendon
-        self._end = 0.0  # of the motion under way [s]
-        self._servo_rate = np.zeros_like(self.servo)  # [rad/s]
-        self._axial_rate = 0.0  # [rad/s]
-        self._metres_per_rad = 1 / float(robot.servo_per_metre)
-        self._lost_bits = max(0, WHEEL_BITS - robot.config.encoder.bits.value)
-        steps_per_turn = COUNTS_PER_TURN >> self._lost_bits
-        self._steps_per_metre = steps_per_turn / (2 * math.pi * float(robot.wheel_radius))
-        self._times = [0.0]
-        self._points = [self.displacements.copy()]
-
-    @property
-    def moving(self) -> bool:
-        """Whether any part moves now."""
-        return self.time < self._end
-
-    def advance(self, now: float) -> None:
-        """Let time pass until ``now`` [s]."""
-        if self.moving and now > self.time:
-            step = min(now, self._end) - self.time
-            turned = self._servo_rate * step
-            self.servo += turned
-            self.axial += self._axial_rate * step
-            for servo, tendon in self.coupled.items():
-                self.displacements[tendon] += turned[servo] * self._metres_per_rad
-            if now >= self._end:
-                self.time = self._end
-                self._note()
-        self.time = max(self.time, now)
-
-    def turn(self, by: Mapping[int, float], duration: float) -> None:
-        """Turn servos {servo: rad} during ``duration`` [s]; they start and end together."""
-        self._begin(duration)
-        for servo, angle in by.items():
-            self._servo_rate[servo] = angle / duration
-
-    def rotate_axial(self, slot: int, duration: float) -> None:
-        """Turn the axial motor to a slot during ``duration`` [s]."""
-        self._begin(duration)
-        goal = self._slot_angle * slot
-        self._axial_rate = (goal - self.axial) / duration
-
-    def brake(self, duration: float) -> None:
-        """Decelerate what moves to a stand within ``duration`` [s], not past its target.
-
-        The parabola of constant deceleration is taken as a straight line of half the speed.
-        """
-        if not self.moving:
-            return
-        duration = min(duration, 2 * (self._end - self.time))
-        rates = self._servo_rate / 2, self._axial_rate / 2
-        self._begin(duration)
-        self._servo_rate, self._axial_rate = rates
-
-    def _begin(self, duration: float) -> None:
-        self._note()
-        self._end = self.time + duration
-        self._servo_rate = np.zeros_like(self.servo)
-        self._axial_rate = 0.0
-
-    def _note(self) -> None:
-        self._times.append(self.time)
-        self._points.append(self.displacements.copy())
-
-    def wheel_counts(self) -> Int[np.ndarray, " S*J"]:
-        """What the wheel encoders read, whole turns included [counts of 14 bits].
-
-        An encoder of fewer bits leaves the low ones 0; of a finer one the bus carries 14.
-        """
-        steps = np.rint(self.displacements * self._steps_per_metre).astype(np.int64)
-        return steps << self._lost_bits
-
-    def servo_bits(self) -> Int[np.ndarray, " J"]:
-        """What the servo encoders read [0.1 degree]."""
-        return np.rint(self.servo * SERVO_BITS_PER_RAD).astype(np.int64)
-
-    def trajectory(
-        self, since: float
-    ) -> tuple[Float[np.ndarray, " K"], Float[np.ndarray, "K S*J"]]:
-        """Break points of the true displacements from ``since`` [s] to now: times, values [m].
-
-        Between two points every tendon moves at constant speed.
-        """
-        times = np.array([*self._times, self.time])
-        points = np.array([*self._points, self.displacements])
-        kept = times > since
-        first = [np.interp(since, times, column) for column in points.T]
-        return np.r_[since, times[kept]], np.vstack([first, points[kept]])

@@ -1,30 +1,36 @@
 """A board that exists only in memory: the firmware's state machine over simulated mechanics.
 
 Sans-IO: ``step(now, frames)`` takes what arrived, lets time pass until ``now`` and returns what
-the board sends. It models: the whole protocol of docs/protocol.md with its state machine,
-watchdog, interlocks and range limits; durations of the axial motor, clutches, probes and servos;
-the constant-speed motion of servos and wheels; braking; encoder quantisation and turn counts;
-feedback streams at their rates.
+the board sends. What it models is stated by configs/hardware/*.yaml: the whole protocol of
+docs/protocol.md with its state machine, watchdog, interlocks and range limits; inertia of axial
+motor and servos; backlash; plugs that look for their slots; tendons that slip when a clutch
+switches; encoders with quantisation, noise, smooth errors, parity; the servos' UART; heat of the
+coils; loss of supply, a hung controller, and every fault of ``faults.FaultKind``.
 
-It does not model: faults of any part, acceleration, backlash, clutch mis-seating and slip, INL and
-noise of encoders, coil heat, currents under load, brown-out, bus arbitration and bus-off. The
-load on the tendons never stalls a servo, and a relaxed servo holds still.
+It does not model: the load on the tendons (nothing stalls by itself, a relaxed servo holds
+still), elasticity, servo tuning, temperature of anything but the coils, CAN's own error frames.
 """
 
 from __future__ import annotations
 
+import heapq
 import math
-from collections.abc import Callable, Collection, Generator, Iterable
+from collections.abc import Callable, Collection, Iterable
+from itertools import count
 
 import numpy as np
 from jaxtyping import Float
 
-from muxjax.hardware import feedback
+from muxjax.hardware import feedback, upsets
+from muxjax.hardware.coils import Coils
+from muxjax.hardware.commands import HANDLERS, Job, come_to_rest
+from muxjax.hardware.encoders import EncoderCalibration, Encoders
+from muxjax.hardware.faults import FaultClock, FaultConfig, FaultKind
+from muxjax.hardware.guards import FAULTS, WINDOW_COUNTS, Guards, Trip
 from muxjax.hardware.interlocks import refusal
-from muxjax.hardware.physics import Mechanics, PhysicsConfig, axial_time, load_physics, probe_time
+from muxjax.hardware.mechanics import Mechanics
+from muxjax.hardware.physics import PhysicsConfig, axial_time, load_physics
 from muxjax.hardware.protocol import (
-    COUNTS_PER_TURN,
-    SERVO_BITS_PER_RAD,
     WATCHDOG_S,
     BoardState,
     Fault,
@@ -37,10 +43,9 @@ from muxjax.hardware.protocol import (
     check_robot_fits,
     fingerprint_words,
 )
+from muxjax.hardware.sensing import Senses
 from muxjax.robot import Robot
 from muxjax.tendons import check_displacements, displacement_range
-
-Job = Generator[float, None, Reason]  # yields how long to wait [s], returns how it ended
 
 RANGE_MARGIN_M = 1e-4  # beyond the tendon range: rounding of encoders and targets, not travel
 SEQUENCE_WINDOW = 16  # a new command's number is at most this far ahead of the last one
@@ -58,13 +63,17 @@ class VirtualBoard:
         physics: Physics, or the name or path of a file of them.
         displacements: Tendon displacements at power-up [m]; straight if None.
         axial: Axial position at power-up, from 1; between two if None.
+        faults: Faults beyond those of the physics.
+        seed: Of everything that is drawn.
 
     Attributes:
-        mechanics: The truth. The controller's code reads it through its sensors only.
+        mechanics: The truth. The controller's code reads it through ``senses`` only.
+        senses: What the controller's sensors say.
 
     Raises:
         ValueError: The protocol cannot carry the robot, the physics do not fit its switch time,
-            the displacements are beyond its range, or it has no such axial position.
+            the displacements are beyond its range, it has no such axial position, or a fault
+            names a servo or tendon that it has not.
     """
 
     def __init__(
@@ -73,6 +82,8 @@ class VirtualBoard:
         physics: PhysicsConfig | str = "ideal",
         displacements: Collection[float] | Float[np.ndarray, " S*J"] | None = None,
         axial: int | None = None,
+        faults: Iterable[FaultConfig] = (),
+        seed: int = 0,
     ) -> None:
         check_robot_fits(robot)
         start = np.zeros(robot.n_tendons) if displacements is None else displacements
@@ -81,38 +92,73 @@ class VirtualBoard:
             raise ValueError(f"displacements: must have one axis, found shape {start.shape}")
         self.robot = robot
         self.physics = load_physics(physics) if isinstance(physics, str) else physics
-        self.mechanics = Mechanics(robot, start, _slot(robot, axial))
+        axial_time(robot, self.physics, 0.0)  # physics that do not fit are refused here
+        for_mechanics, for_encoders, for_faults = np.random.default_rng(seed).spawn(3)
+        slot = _slot(robot, axial)
+        self.mechanics = Mechanics(robot, self.physics, start, slot, for_mechanics)
+        self.senses = Senses(robot, self.mechanics, _encoders(robot, self.physics, for_encoders))
+        self.coils = Coils(self.physics.coil)
+        self.guards = Guards()
+        self.volts = self.physics.supply_v
         self.limits = displacement_range(robot) + np.array([-RANGE_MARGIN_M, RANGE_MARGIN_M])
+        self.window_counts = WINDOW_COUNTS
         self.facing = robot.axial_map.tolist()  # tendon that each servo meets, [slot][servo]
         self.words = fingerprint_words(robot.fingerprint)
+        self.cut_off: set[FaultKind] = set()  # what keeps frames from the board
+        self.boots = 0
+        self._faults_due = FaultClock(
+            (*self.physics.faults, *faults), robot.tendons_per_segment, robot.n_tendons, for_faults
+        )
+        self._plans: list[tuple[float, int, Callable[[], object]]] = []
+        self._number = count()
+        self._start_controller(slot)
+
+    def _start_controller(self, slot: int) -> None:
+        """Everything that the controller keeps in memory, as it is after a reset."""
         self.state = BoardState.SILENT
         self.faults = Fault(0)
         self.refused: dict[Refusal, int] = dict.fromkeys(Refusal, 0)
         self.session = 0
         self.words_matched: set[int] = set()
         self.last_seq = 0
+        self.slot = slot  # where the controller knows the drum to stand
         self.energised: set[int] = set()  # tendons whose coil has current
         self.verified: set[int] = set()  # tendons whose clutch both encoders saw coupled
+        self.suspects: set[int] = set()  # tendons whose clutch nobody saw come out
         self.staged: dict[int, float] = {}  # servo: absolute shaft angle [rad]
         self.axial_turning = False
         self.stream_divider = 1
+        self.boots += 1
+        self.running = True  # the controller's program
+        self._booted_at = self.mechanics.time
         self._port = Port("BOARD")
         self._out: list[Frame] = []
         self._answers: dict[int, tuple[Status, Reason]] = {}
         self._host_heard, self._watchdog = -math.inf, WATCHDOG_S
-        self._axial_time = axial_time(robot, self.physics)
-        self._probe_time = probe_time(robot, self.physics)
         self._job: Job | None = None
         self._job_command: tuple[int, int] | None = None  # its seq and op, if one started it
         self._job_due = math.inf
         self._ticks, self._tick_due = 0, math.inf
 
+    def calibrate(self, table: EncoderCalibration) -> None:
+        """Enter a lab's table of encoder errors; the board then reports corrected angles."""
+        self.senses.encoders.calibration = table
+
     # The clock
+
+    @property
+    def now(self) -> float:
+        """Time that has passed [s]."""
+        return self.mechanics.time
 
     @property
     def next_time(self) -> float:
         """When something happens next if no frame arrives [s]; inf if nothing will."""
-        return min(self._job_due, self._tick_due, self._watchdog_end)
+        plan = self._plans[0][0] if self._plans else math.inf
+        outside = min(plan, self._faults_due.next_time)
+        if not self.running:
+            return outside
+        return min(self._job_due, self._tick_due, self._watchdog_end, outside)
 
     @property
     def watchdog_due(self) -> float:
@@ -128,30 +174,81 @@ class VirtualBoard:
         self._out = []
         while (due := self.next_time) <= now:
             self.mechanics.advance(due)
-            if due == self._watchdog_end:
-                self.faults |= Fault.WATCHDOG
-                self._stop(BoardState.SAFE, Reason.WATCHDOG)
-            elif due == self._job_due:
-                self._continue_job()
-            else:
-                feedback.stream(self, self._ticks)
-                self._ticks += 1
-                self._tick_due += feedback.TICK_S
+            self._happen(due)
         self.mechanics.advance(now)
-        for frame in frames:
-            self._receive(frame)
+        if self.running and not self.cut_off:
+            for frame in frames:
+                self._receive(frame)
         return self._out
+
+    def _happen(self, due: float) -> None:
+        if self._plans and due == self._plans[0][0]:
+            heapq.heappop(self._plans)[2]()
+        elif due == self._faults_due.next_time:
+            upsets.upset(self, *self._faults_due.take())
+        elif due == self._watchdog_end:
+            self.faults |= Fault.WATCHDOG
+            self._stop(BoardState.SAFE, Reason.WATCHDOG)
+        elif due == self._job_due:
+            self._continue_job()
+        else:
+            self._tick()
+
+    def _tick(self) -> None:
+        """Every 10 ms since the first HELLO: guards, then streams."""
+        self.coils.pass_time(self.now, len(self.energised))
+        if self.state is BoardState.ARMED:
+            try:
+                self.guards.look(self)
+            except Trip as trip:
+                self._trip(trip)
+        feedback.stream(self, self._ticks)
+        self._ticks += 1
+        self._tick_due += feedback.TICK_S
+
+    def plan(self, after: float, what: Callable[[], object]) -> None:
+        """Let something happen outside the controller ``after`` so long [s]."""
+        heapq.heappush(self._plans, (self.now + after, next(self._number), what))
 
     @property
     def milliseconds(self) -> int:
         """Board clock as the bus carries it; rounded down, but not by rounding errors."""
-        return int(self.mechanics.time * 1e3 + 1e-6) & 0xFFFF
+        return int((self.now - self._booted_at) * 1e3 + 1e-6) & 0xFFFF
+
+    # Supply
+
+    def power_cycle(self, off_s: float = 0.5) -> None:
+        """Somebody switches the board off and on again; it comes up after booting.
+
+        The servos run on to the last target they were given. Coils lose their current at once.
+        """
+        self.halt()
+        self.energised = set()
+        every = range(self.robot.n_tendons)
+        self.plan(self.physics.clutch_out_s, lambda: self.mechanics.unseat(every))
+        boots = self.boots
+        self.plan(off_s + self.physics.controller.boot_s, lambda: self._power_up(boots))
+
+    def halt(self) -> None:
+        """The controller's program stands still; servos run on to their last target."""
+        self.running = False
+        self.mechanics.brake(self.physics.controller.horizon_s)
+
+    def _power_up(self, boots: int) -> None:
+        if boots != self.boots:  # another one came first
+            return
+        self._start_controller(slot=-1)
+        self.cut_off.discard(FaultKind.BUS_OFF)
+        self.volts = self.physics.supply_v
+        self.senses.lose_turns()
+        self.faults = Fault.TURNS_LOST
 
     # Sending and receiving
 
     def send(self, name: str, **values: float) -> None:
         """Queue a message of the DBC."""
-        self._out.append(self._port.pack(name, **values))
+        if not self.cut_off:
+            self._out.append(self._port.pack(name, **values))
 
     def _receive(self, frame: Frame) -> None:
         received = self._port.unpack(frame)
@@ -165,14 +262,15 @@ class VirtualBoard:
         elif received.name == "CMD":
             self._command(values["Seq"], values["Op"], values["Idx"], values["Arg"])
         elif values["Session"] == self.session:
-            self._host_heard = self.mechanics.time
+            self._host_heard = self.now
             self._watchdog = min(values["Watchdog"] * 1e-3, WATCHDOG_S)
 
     def _estop(self) -> None:
         if self.state is not BoardState.ESTOPPED:
             self.faults |= Fault.ESTOP
             self._stop(BoardState.ESTOPPED, Reason.ESTOPPED)
-        self._start_streams()
+        if self._tick_due == math.inf:
+            self.start_streams(1)
         feedback.heartbeat(self)
 
     def _command(self, seq: int, op: int, idx: int, arg: int) -> None:
@@ -197,6 +295,7 @@ class VirtualBoard:
             self._answer(seq, op, Status.REJECTED, *refused)
 
     def _obey(self, seq: int, op: Op, idx: int, arg: int) -> None:
+        self._faults_due.executed(op, self.now)
         job = HANDLERS[op](self, idx, arg)
         self.last_seq = seq
         self._answer(seq, op, Status.DONE if job is None else Status.ACCEPTED, Reason.NONE)
@@ -218,9 +317,17 @@ class VirtualBoard:
         detail = self.milliseconds if detail is None else detail
         self.send("ACK", Seq=seq, Op=op, Status=status, Reason=reason, Detail=detail)
 
-    def _start_streams(self) -> None:
-        if self._tick_due == math.inf:
-            self._set_stream(0, 1)
+    def greet(self, session: int) -> None:
+        """A session begins."""
+        self.state, self.session = BoardState.READY, session
+        self._answers.clear()
+        self.words_matched.clear()
+        self._host_heard = -math.inf
+        self.start_streams(1)
+
+    def start_streams(self, divider: int) -> None:
+        """Begin the streams anew, so that the first of each comes at once."""
+        self.stream_divider, self._ticks, self._tick_due = divider, 0, self.now
 
     # Jobs, one at a time
 
@@ -236,9 +343,11 @@ class VirtualBoard:
     def _continue_job(self) -> None:
         assert self._job is not None  # _job_due is finite only with a job
         try:
-            self._job_due = self.mechanics.time + next(self._job)
+            self._job_due = next(self._job)
         except StopIteration as end:
             self._end_job(end.value)
+        except Trip as trip:
+            self._trip(trip)
 
     def _end_job(self, reason: Reason) -> None:
         """Answer for the job, then show what the sensors say now, ahead of the next tick."""
@@ -250,129 +359,37 @@ class VirtualBoard:
         feedback.servos(self)
         feedback.wheels(self)
 
-    def _abort_job(self, reason: Reason) -> None:
+    def abort_job(self, reason: Reason) -> None:
+        """Break off the job, if there is one, and answer for it."""
         if self._job is not None:
             self._job.close()
             self._end_job(reason)
 
-    def _stop(self, state: BoardState, reason: Reason) -> None:
+    def _trip(self, trip: Trip) -> None:
+        self.faults |= FAULTS[trip.reason]
+        self._stop(BoardState.SAFE, trip.reason, trip.index)
+
+    def _stop(self, state: BoardState, reason: Reason, index: int = 0) -> None:
         """Abort the job, tell, brake, then take the clutches off."""
         ran = self._job_command[1] if self._job is not None and self._job_command else 0
         self.state = state
         self.words_matched.clear()
-        self._abort_job(reason)
-        self.send("EMCY", Severity=2, Code=reason, Subsystem=ran, Detail=self.milliseconds)
-        self._start_job(self._come_to_rest(), None)
-
-    def _come_to_rest(self) -> Job:
-        self.staged.clear()
-        if self.mechanics.moving:
-            self.mechanics.brake(self.physics.brake_s)
-            yield self.physics.brake_s
-        self.axial_turning = False
-        may_be_in = bool(self.energised | self.verified)  # a plug is not seen, only its coil
-        self.energised.clear()
-        if may_be_in:
-            yield self.physics.clutch_out_s
-        self.mechanics.coupled.clear()
-        self.verified.clear()
-        return Reason.NONE
-
-    # What the commands do; each returns a job if it takes time
-
-    def _hello(self, idx: int, arg: int) -> None:
-        self.state, self.session = BoardState.READY, arg & 0xFFFF
-        self._answers.clear()
-        self.words_matched.clear()
-        self._host_heard = -math.inf
-        self._set_stream(0, 1)
-
-    def _robot(self, idx: int, arg: int) -> None:
-        self.words_matched.add(idx)
-
-    def _set_stream(self, idx: int, arg: int) -> None:
-        """Begin the streams anew, so that the first of each comes at once."""
-        self.stream_divider, self._ticks, self._tick_due = arg, 0, self.mechanics.time
-
-    def _arm(self, idx: int, arg: int) -> None:
-        self.state = BoardState.ARMED
-
-    def _disarm(self, idx: int, arg: int) -> Job | None:
-        self.state = BoardState.READY
-        self.words_matched.clear()
-        if self._job is None and not self.energised | self.verified:
-            return None
-        self._abort_job(Reason.DISARMED)
-        return self._come_to_rest()
-
-    def _axial(self, idx: int, arg: int) -> Job | None:
-        return None if arg - 1 == self.mechanics.slot else self._turn_axial(arg)
-
-    def _turn_axial(self, arg: int) -> Job:
-        self.axial_turning, self.mechanics.slot = True, -1
-        self.mechanics.rotate_axial(arg - 1, self._axial_time)
-        yield self._axial_time
-        self.axial_turning, self.mechanics.slot = False, arg - 1
-        return Reason.NONE
-
-    def _engage(self, idx: int, arg: int) -> Job:
-        wanted = self.clutches_in(arg)
-        self.energised |= wanted.keys()
-        yield self.physics.clutch_in_s
-        self.mechanics.coupled.update({servo: tendon for tendon, servo in wanted.items()})
-        followed = yield from self._probe(wanted)
-        self.verified |= followed
-        return Reason.NONE if followed == wanted.keys() else Reason.NOT_SEATED
-
-    def _release(self, idx: int, arg: int) -> Job:
-        wanted = self.clutches_in(arg)
-        self.energised -= wanted.keys()
-        yield self.physics.clutch_out_s
-        for servo in wanted.values():
-            self.mechanics.coupled.pop(servo, None)
-        followed = yield from self._probe(wanted)
-        self.verified -= wanted.keys() - followed
-        return Reason.NOT_RELEASED if followed else Reason.NONE
-
-    def _probe(self, tendons: dict[int, int]) -> Generator[float, None, set[int]]:
-        """Turn the servos a little and back; which of {tendon: servo} had a wheel that followed.
-
-        Each turns towards the middle of its tendon's range, so that no probe leaves the range.
-        """
-        before = self.mechanics.wheel_counts()
-        angle, half = math.radians(self.physics.probe_angle_deg), self._probe_time / 2
-        centre = self.limits.mean(axis=1) - self.sensed_displacements()
-        by = {s: angle if centre[c] > 0 else -angle for c, s in tendons.items()}
-        self.mechanics.turn(by, half)
-        yield half
-        moved = np.abs(self.mechanics.wheel_counts() - before)
-        self.mechanics.turn({s: -a for s, a in by.items()}, half)
-        yield half
-        expected = angle / float(self.robot.gear_ratio) * COUNTS_PER_TURN / (2 * math.pi)
-        return {c for c in tendons if moved[c] > expected / 2}
-
-    def _stage(self, idx: int, arg: int) -> None:
-        self.staged[idx - 1] = arg / SERVO_BITS_PER_RAD
-
-    def _move(self, idx: int, arg: int) -> Job:
-        by = {s: self.staged.pop(s) - float(self.mechanics.servo[s]) for s in self.servos_in(arg)}
-        duration = max(abs(angle) for angle in by.values()) / float(self.robot.servo_speed)
-        if duration > 0:
-            self.mechanics.turn(by, duration)
-            yield duration
-        return Reason.NONE
+        self.abort_job(reason)
+        detail = self.milliseconds
+        self.send("EMCY", Severity=2, Code=reason, Subsystem=ran, Index=index, Detail=detail)
+        self._start_job(come_to_rest(self), None)
 
     # What the controller knows
 
     @property
     def layer(self) -> int:
         """Layer that the servos face; -1 between slots."""
-        slot = self.mechanics.slot
+        slot = self.slot
         return -1 if slot < 0 else self.facing[slot][0] // len(self.facing[slot])
 
     def clutches_in(self, mask: int) -> dict[int, int]:
         """{tendon: servo that faces it} of a clutch mask of the present layer."""
-        facing = self.facing[self.mechanics.slot]
+        facing = self.facing[self.slot]
         return {c: s for s, c in enumerate(facing) if mask >> (c % len(facing)) & 1}
 
     def clutch_mask(self, tendons: Collection[int]) -> int:
@@ -385,15 +402,17 @@ class VirtualBoard:
 
     def tendon_of(self, servo: int) -> int | None:
         """Tendon that a servo is verified to drive."""
-        if self.mechanics.slot < 0:
+        if self.slot < 0:
             return None
-        tendon = self.facing[self.mechanics.slot][servo]
+        tendon = self.facing[self.slot][servo]
         return tendon if tendon in self.verified & self.energised else None
 
-    def sensed_displacements(self) -> Float[np.ndarray, " S*J"]:
-        """Displacements [m] by the wheel encoders."""
-        radians = self.mechanics.wheel_counts() * (2 * math.pi / COUNTS_PER_TURN)
-        return radians * float(self.robot.wheel_radius)
+    def in_use(self) -> dict[int, int]:
+        """{servo: tendon} whose clutch has current."""
+        if not self.energised:
+            return {}
+        facing = self.facing[self.slot]
+        return {s: c for s, c in enumerate(facing) if c in self.energised}
 
 
 def _slot(robot: Robot, axial: int | None) -> int:
@@ -402,15 +421,17 @@ def _slot(robot: Robot, axial: int | None) -> int:
     return -1 if axial is None else axial - 1
 
 
-HANDLERS: dict[Op, Callable[[VirtualBoard, int, int], Job | None]] = {
-    Op.HELLO: VirtualBoard._hello,
-    Op.ROBOT: VirtualBoard._robot,
-    Op.ARM: VirtualBoard._arm,
-    Op.DISARM: VirtualBoard._disarm,
-    Op.AXIAL: VirtualBoard._axial,
-    Op.ENGAGE: VirtualBoard._engage,
-    Op.RELEASE: VirtualBoard._release,
-    Op.STAGE: VirtualBoard._stage,
-    Op.START: VirtualBoard._move,
-    Op.SET_STREAM: VirtualBoard._set_stream,
-}
+def _encoders(robot: Robot, physics: PhysicsConfig, rng: np.random.Generator) -> Encoders:
+    """The robot's encoders, calibrated if the physics say so."""
+    errors = physics.encoder
+    encoders = Encoders(
+        robot.n_tendons,
+        robot.config.encoder.bits.value,
+        errors.inl_deg,
+        errors.noise_counts,
+        errors.parity_rate,
+        rng,
+    )
+    if errors.calibration_points:
+        encoders.calibration = encoders.measure(errors.calibration_points)
+    return encoders

@@ -18,7 +18,9 @@ import numpy as np
 
 from muxjax.hardware import protocol
 from muxjax.hardware.codec import database
+from muxjax.hardware.guards import FOLLOW, PATIENCE, WINDOW_COUNTS
 from muxjax.hardware.physics import PhysicsConfig
+from muxjax.hardware.sensing import BAD_SAMPLES
 from muxjax.hardware.virtual_board import (
     RANGE_MARGIN_M,
     REMEMBERED,
@@ -131,6 +133,7 @@ def config_source(robot: Robot, physics: PhysicsConfig) -> str:
         "clutch_out_ms": physics.clutch_out_s,
         "brake_ms": physics.brake_s,
     }
+    controller = physics.controller
     coil = robot.config.clutch.coil_current_a.value
     fields = {
         "words": _list(f"0x{word:04X}" for word in words),
@@ -155,6 +158,13 @@ def config_source(robot: Robot, physics: PhysicsConfig) -> str:
             * protocol.COUNTS_PER_TURN
             / (2 * math.pi)
         ),
+        "horizon_ms": math.floor(controller.horizon_s * 1e3 + 1e-6),
+        "lowest_voltage": round(100 * controller.lowest_v),
+        "hottest_coil": math.floor(physics.coil.limit_c) + 40,
+        "window_counts": _number(WINDOW_COUNTS),
+        "follow": _number(FOLLOW),
+        "patience": PATIENCE,
+        "bad_samples": BAD_SAMPLES,
         **{name: math.ceil(value * 1e3 - 1e-6) for name, value in seconds.items()},
     }
     rows = [f"    {_list(row)}," for row in robot.axial_map.tolist()]

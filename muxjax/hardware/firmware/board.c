@@ -90,10 +90,15 @@ static uint16_t held(const struct board *b)
     return count;
 }
 
+/* A reading with a bad status is not used, the last good one stands. */
 static void read_wheels(struct board *b)
 {
     const int32_t half = TDMA_COUNTS_PER_TURN / 2;
     for (uint8_t c = 0; c < tendons(b); c++) {
+        b->wheel_bits[c] = b->hal->wheel_status(b->hal->context, c);
+        if (b->wheel_bits[c]) {
+            continue;
+        }
         int32_t angle = b->hal->wheel_angle(b->hal->context, c);
         int32_t moved = (angle - b->counts[c]) & (TDMA_COUNTS_PER_TURN - 1);
         b->counts[c] += moved >= half ? moved - TDMA_COUNTS_PER_TURN : moved;
@@ -189,7 +194,7 @@ static uint16_t wheel_word(const struct board *b, uint8_t tendon)
 
 static uint8_t wheel_flags(const struct board *b, uint8_t tendon)
 {
-    return tendon < tendons(b) ? b->hal->wheel_status(b->hal->context, tendon) : 0u;
+    return tendon < tendons(b) ? b->wheel_bits[tendon] : 0u;
 }
 
 static void send_wheels(struct board *b)
@@ -213,7 +218,7 @@ static void send_wheels(struct board *b)
 
 static int8_t whole_turns(const struct board *b, uint8_t tendon)
 {
-    if (tendon >= tendons(b) || !b->turns_known[tendon]) {
+    if (tendon >= tendons(b)) {
         return 0;
     }
     /* floor, for negative counts too */
@@ -274,8 +279,6 @@ static void send_streams(struct board *b)
             send_turns(b); /* with the wheels: sampled at one instant */
         }
     }
-    b->tick++;
-    b->tick_due += BOARD_TICK_MS;
 }
 
 static void begin_streams(struct board *b, uint8_t divider)
@@ -320,7 +323,7 @@ static void answer(struct board *b, uint16_t seq, uint8_t op, uint8_t status, ui
 static void feed_servos(struct board *b)
 {
     uint32_t since = b->now - b->move_begin;
-    uint32_t ahead = since + BOARD_HORIZON_MS;
+    uint32_t ahead = since + b->config->horizon_ms;
     int32_t goals[TDMA_MAX_SERVOS] = {0};
     if (ahead > b->move_ms) {
         ahead = b->move_ms;
@@ -361,6 +364,7 @@ static void end_job(struct board *b, uint8_t reason)
 {
     b->job = BOARD_IDLE;
     b->moving = false;
+    b->comparing = false;
     if (b->job_ordered) {
         uint8_t status = reason == TDMA_REASON_NONE ? TDMA_STATUS_DONE : TDMA_STATUS_ABORTED;
         answer(b, b->job_seq, b->job_op, status, reason, (uint16_t)b->now);
@@ -381,6 +385,7 @@ static void drop_clutches(struct board *b)
     bool any = held(b) > 0;
     b->axial_turning = false;
     for (uint8_t c = 0; c < tendons(b); c++) {
+        b->suspect[c] = b->suspect[c] || b->energised[c] || b->verified[c];
         b->energised[c] = false;
         b->hal->clutch_coil(b->hal->context, c, false);
     }
@@ -421,6 +426,30 @@ static void stop(struct board *b, uint8_t state, uint8_t reason, uint8_t index)
     come_to_rest(b, was_moving, false);
 }
 
+static uint8_t fault_of(uint8_t reason)
+{
+    switch (reason) {
+    case TDMA_REASON_SERVO_STALLED:
+    case TDMA_REASON_SERVO_OFFLINE:
+        return TDMA_FAULT_SERVO;
+    case TDMA_REASON_ENCODER_FAULT:
+        return TDMA_FAULT_ENCODER;
+    case TDMA_REASON_COIL_HOT:
+        return TDMA_FAULT_COIL_HOT;
+    case TDMA_REASON_UNDERVOLTAGE:
+        return TDMA_FAULT_VOLTAGE;
+    default: /* WHEEL_STILL: either may be at fault */
+        return TDMA_FAULT_ENCODER | TDMA_FAULT_SERVO;
+    }
+}
+
+/* A part failed: to the safe state. index: servo or tendon, from 1; 0 if none. */
+static void trip(struct board *b, uint8_t reason, uint8_t index)
+{
+    b->faults |= fault_of(reason);
+    stop(b, TDMA_STATE_SAFE, reason, index);
+}
+
 static void begin_probe(struct board *b)
 {
     for (uint8_t s = 0; s < b->config->servos; s++) {
@@ -437,13 +466,35 @@ static void begin_probe(struct board *b)
     wait(b, BOARD_PROBE_OUT, begin_move(b));
 }
 
+/* What a servo that must turn, and did not, says; TDMA_REASON_NONE if all turned. */
+static uint8_t servo_stood(const struct board *b, uint8_t *servo)
+{
+    for (uint8_t s = 0; s < b->config->servos; s++) {
+        if (b->job_mask >> s & 1u) {
+            int32_t way = b->hal->servo_position(b->hal->context, s) - b->move_from[s];
+            if ((way < 0 ? -way : way) < b->config->follow * b->config->probe_bits) {
+                *servo = s;
+                bool silent = b->hal->servo_status(b->hal->context, s) & BOARD_SERVO_OFFLINE;
+                return silent ? TDMA_REASON_SERVO_OFFLINE : TDMA_REASON_SERVO_STALLED;
+            }
+        }
+    }
+    return TDMA_REASON_NONE;
+}
+
 static void turn_probe_back(struct board *b)
 {
+    uint8_t servo = 0;
+    uint8_t reason = b->job_op == TDMA_OP_AXIAL ? TDMA_REASON_NONE : servo_stood(b, &servo);
+    if (reason) {
+        trip(b, reason, (uint8_t)(servo + 1));
+        return;
+    }
     b->probe_followed = 0;
     for (uint8_t s = 0; s < b->config->servos; s++) {
         if (b->job_mask >> s & 1u) {
             int32_t moved = b->counts[facing(b, s)] - b->probe_from[s];
-            if ((moved < 0 ? -moved : moved) > b->config->probe_counts / 2) {
+            if ((moved < 0 ? -moved : moved) > b->config->follow * b->config->probe_counts) {
                 b->probe_followed |= (uint16_t)(1u << s);
             }
         }
@@ -452,22 +503,42 @@ static void turn_probe_back(struct board *b)
     wait(b, BOARD_PROBE_BACK, begin_move(b));
 }
 
+static void turn_axial(struct board *b)
+{
+    memset(b->suspect, 0, sizeof b->suspect);
+    if (b->job_position == b->position) {
+        end_job(b, TDMA_REASON_NONE);
+        return;
+    }
+    b->axial_turning = true;
+    b->position = -1;
+    b->hal->axial_turn(b->hal->context, b->job_position);
+    wait(b, BOARD_AXIAL, 1);
+}
+
 static void end_probe(struct board *b)
 {
     bool engaged = b->job_op == TDMA_OP_ENGAGE;
+    bool any = b->probe_followed != 0;
     for (uint8_t s = 0; s < b->config->servos; s++) {
         if (b->job_mask >> s & 1u) {
-            bool followed = b->probe_followed >> s & 1u;
-            if (engaged == followed) {
-                b->verified[facing(b, s)] = engaged;
+            if (b->probe_followed >> s & 1u) {
+                b->verified[facing(b, s)] = b->verified[facing(b, s)] || b->job_op != TDMA_OP_RELEASE;
+            } else if (!engaged) {
+                b->verified[facing(b, s)] = false;
             }
         }
     }
+    b->moving = false;
     if (engaged) {
         bool all = b->probe_followed == b->job_mask;
         end_job(b, all ? TDMA_REASON_NONE : TDMA_REASON_NOT_SEATED);
+    } else if (any) {
+        end_job(b, TDMA_REASON_NOT_RELEASED);
+    } else if (b->job_op == TDMA_OP_AXIAL) {
+        turn_axial(b);
     } else {
-        end_job(b, b->probe_followed ? TDMA_REASON_NOT_RELEASED : TDMA_REASON_NONE);
+        end_job(b, TDMA_REASON_NONE);
     }
 }
 
@@ -554,15 +625,33 @@ static struct refused check_robot(const struct board *b, uint8_t idx, int32_t ar
     return known && arg == own ? FINE : refuse(TDMA_REASON_WRONG_ROBOT, own);
 }
 
+/* Counts of the wheel of TURNS, were it in the turn that its arg says. */
+static int32_t told_counts(const struct board *b, int32_t arg)
+{
+    int32_t within = b->counts[(arg >> 16) - 1] & (TDMA_COUNTS_PER_TURN - 1);
+    return within + (int16_t)(arg & 0xFFFF) * (int32_t)TDMA_COUNTS_PER_TURN;
+}
+
 static struct refused check_turns(const struct board *b, int32_t arg)
 {
+    if (b->state == TDMA_STATE_ARMED) {
+        return refuse(TDMA_REASON_ARMED_ALREADY, b->session);
+    }
     struct refused greeted = check_greeted(b);
     if (greeted.reason) {
         return greeted;
     }
-    int32_t wheel = arg >> 16;
-    return 1 <= wheel && wheel <= tendons(b) ? FINE
-                                             : refuse(TDMA_REASON_UNKNOWN_CLUTCH, tendons(b));
+    int32_t wheel = (arg >> 16) - 1;
+    if (!(0 <= wheel && wheel < tendons(b))) {
+        return refuse(TDMA_REASON_TURNS_UNKNOWN, tendons(b));
+    }
+    int32_t told = told_counts(b, arg);
+    if (!b->turns_open[wheel] && told != b->counts[wheel]) {
+        return refuse(TDMA_REASON_TURNS_UNKNOWN, (uint16_t)(wheel + 1));
+    }
+    double length = told * b->config->metres_per_count;
+    bool inside = b->config->low_m[wheel] <= length && length <= b->config->high_m[wheel];
+    return inside ? FINE : refuse(TDMA_REASON_TENDON_RANGE, (uint16_t)(wheel + 1));
 }
 
 static struct refused check_arm(const struct board *b, int32_t arg)
@@ -585,9 +674,17 @@ static struct refused check_arm(const struct board *b, int32_t arg)
         return refuse(TDMA_REASON_ROBOT_UNCHECKED, matched);
     }
     for (uint8_t c = 0; c < tendons(b); c++) {
-        if (!b->turns_known[c]) {
+        if (b->turns_unknown[c]) {
             return refuse(TDMA_REASON_TURNS_UNKNOWN, (uint16_t)(c + 1));
         }
+    }
+    uint16_t voltage = b->hal->voltage(b->hal->context);
+    if (voltage < b->config->lowest_voltage) {
+        return refuse(TDMA_REASON_UNDERVOLTAGE, voltage);
+    }
+    uint8_t coil = b->hal->clutch_temperature(b->hal->context);
+    if (coil > b->config->hottest_coil) {
+        return refuse(TDMA_REASON_COIL_HOT, (uint16_t)(coil - 40));
     }
     if (!host_alive(b)) {
         return refuse(TDMA_REASON_NO_HEARTBEAT, 0);
@@ -729,14 +826,13 @@ static void hello(struct board *b, int32_t arg)
 static void learn_turns(struct board *b, int32_t arg)
 {
     uint8_t c = (uint8_t)((arg >> 16) - 1);
-    int32_t within = b->counts[c] & (TDMA_COUNTS_PER_TURN - 1);
-    b->counts[c] = within + (int16_t)(arg & 0xFFFF) * (int32_t)TDMA_COUNTS_PER_TURN;
-    b->turns_known[c] = true;
-    bool all = true;
+    b->counts[c] = told_counts(b, arg);
+    b->turns_unknown[c] = false;
+    bool any = false;
     for (uint8_t k = 0; k < tendons(b); k++) {
-        all = all && b->turns_known[k];
+        any = any || b->turns_unknown[k];
     }
-    if (all) {
+    if (!any) {
         b->faults &= (uint8_t)~TDMA_FAULT_TURNS_LOST;
     }
 }
@@ -750,6 +846,16 @@ static void switch_coils(struct board *b, bool on)
         }
     }
     wait(b, BOARD_COILS, on ? b->config->clutch_in_ms : b->config->clutch_out_ms);
+}
+
+static bool any_suspect(const struct board *b)
+{
+    for (uint8_t c = 0; c < tendons(b); c++) {
+        if (b->suspect[c]) {
+            return true;
+        }
+    }
+    return false;
 }
 
 /* Commands that take no time; false: begin_job has to follow. */
@@ -766,10 +872,11 @@ static bool obey_at_once(struct board *b, uint8_t op, uint8_t idx, int32_t arg)
         learn_turns(b, arg);
         return true;
     case TDMA_OP_ARM:
+        memset(b->turns_open, 0, sizeof b->turns_open);
         b->state = TDMA_STATE_ARMED;
         return true;
     case TDMA_OP_AXIAL:
-        return arg - 1 == b->position;
+        return arg - 1 == b->position && !any_suspect(b);
     case TDMA_OP_STAGE:
         b->staged |= (uint16_t)(1u << (idx - 1));
         b->staged_goal[idx - 1] = arg;
@@ -782,15 +889,29 @@ static bool obey_at_once(struct board *b, uint8_t op, uint8_t idx, int32_t arg)
     }
 }
 
+static void begin_comparison(struct board *b)
+{
+    b->comparing = b->moving;
+    for (uint8_t s = 0; s < b->config->servos; s++) {
+        b->mark_servo[s] = b->move_from[s];
+        b->mark_wheel[s] = b->counts[facing(b, s)];
+    }
+}
+
 static void begin_job(struct board *b, uint8_t op, int32_t arg)
 {
     switch (op) {
     case TDMA_OP_AXIAL:
-        b->axial_turning = true;
-        b->position = -1;
         b->job_position = (uint8_t)(arg - 1);
-        b->hal->axial_turn(b->hal->context, b->job_position);
-        wait(b, BOARD_AXIAL, 1);
+        if (any_suspect(b) && b->position >= 0) { /* first see that every plug is out */
+            b->job_mask = 0;
+            for (uint8_t s = 0; s < b->config->servos; s++) {
+                b->job_mask |= (uint16_t)(b->suspect[facing(b, s)] << s);
+            }
+            begin_probe(b);
+        } else {
+            turn_axial(b);
+        }
         break;
     case TDMA_OP_ENGAGE:
     case TDMA_OP_RELEASE:
@@ -802,6 +923,7 @@ static void begin_job(struct board *b, uint8_t op, int32_t arg)
         b->staged &= (uint16_t)~b->job_mask;
         memcpy(b->move_to, b->staged_goal, sizeof b->move_to);
         wait(b, BOARD_MOVE, begin_move(b));
+        begin_comparison(b);
         break;
     }
 }
@@ -950,10 +1072,103 @@ void board_init(struct board *board, const struct board_config *config,
         board->counts[c] = hal->wheel_angle(hal->context, c);
         if (turns != NULL) {
             board->counts[c] += turns[c] * (int32_t)TDMA_COUNTS_PER_TURN;
-            board->turns_known[c] = true;
         }
+        board->turns_unknown[c] = board->turns_open[c] = turns == NULL;
         hal->clutch_coil(hal->context, c, false);
     }
+}
+
+/* What stops an armed board: faults of parts in use that its sensors show */
+
+static bool lasts(uint8_t *looks, bool now, uint8_t patience)
+{
+    *looks = (uint8_t)(now ? *looks + 1u : 0u);
+    return *looks >= patience;
+}
+
+/* Whether the wheel of a servo follows it; each window begins where the last one ended. */
+static bool follows(struct board *b, uint8_t servo, uint8_t tendon)
+{
+    int32_t position = b->hal->servo_position(b->hal->context, servo);
+    double way = (position - b->mark_servo[servo]) * b->config->metres_per_servo_bit /
+                 b->config->metres_per_count;
+    double gone = b->counts[tendon] - b->mark_wheel[servo];
+    if (fabs(way) < b->config->window_counts) {
+        return true;
+    }
+    if (copysign(1, way) * gone < b->config->follow * fabs(way)) {
+        return false;
+    }
+    b->mark_servo[servo] = position;
+    b->mark_wheel[servo] = b->counts[tendon];
+    return true;
+}
+
+/* Looked at in every tick while armed. */
+static void guard(struct board *b)
+{
+    if (b->hal->voltage(b->hal->context) < b->config->lowest_voltage) {
+        trip(b, TDMA_REASON_UNDERVOLTAGE, 0);
+        return;
+    }
+    if (b->hal->clutch_temperature(b->hal->context) > b->config->hottest_coil) {
+        trip(b, TDMA_REASON_COIL_HOT, 0);
+        return;
+    }
+    uint16_t silent = 0, strained = 0, failed = 0, still = 0; /* servos */
+    for (uint8_t s = 0; s < b->config->servos && b->position >= 0; s++) {
+        uint8_t tendon = facing(b, s);
+        bool used = b->energised[tendon];
+        uint8_t status = b->hal->servo_status(b->hal->context, s);
+        bool offline = status & BOARD_SERVO_OFFLINE;
+        bool stalled = !offline && (status & BOARD_SERVO_STALLED);
+        uint16_t bit = (uint16_t)(1u << s);
+        silent |= lasts(&b->servo_silent[s], used && offline, b->config->patience) ? bit : 0u;
+        strained |= lasts(&b->servo_strained[s], used && stalled, b->config->patience) ? bit : 0u;
+        failed |= used && b->wheel_bad[tendon] >= b->config->bad_samples ? bit : 0u;
+        still |= used && b->comparing && !follows(b, s, tendon) ? bit : 0u;
+    }
+    for (uint8_t s = 0; s < b->config->servos; s++) {
+        if (silent >> s & 1u) {
+            trip(b, TDMA_REASON_SERVO_OFFLINE, (uint8_t)(s + 1));
+            return;
+        }
+    }
+    for (uint8_t s = 0; s < b->config->servos; s++) {
+        if (strained >> s & 1u) {
+            trip(b, TDMA_REASON_SERVO_STALLED, (uint8_t)(s + 1));
+            return;
+        }
+    }
+    for (uint8_t c = 0; c < tendons(b) && failed; c++) {
+        for (uint8_t s = 0; s < b->config->servos; s++) {
+            if ((failed >> s & 1u) && facing(b, s) == c) {
+                trip(b, TDMA_REASON_ENCODER_FAULT, (uint8_t)(c + 1));
+                return;
+            }
+        }
+    }
+    for (uint8_t s = 0; s < b->config->servos; s++) {
+        if (still >> s & 1u) {
+            trip(b, TDMA_REASON_WHEEL_STILL, (uint8_t)(facing(b, s) + 1));
+            return;
+        }
+    }
+}
+
+/* Every 10 ms since the first HELLO: guards, then streams. */
+static void tick(struct board *b)
+{
+    for (uint8_t c = 0; c < tendons(b); c++) {
+        bool bad = b->wheel_bits[c] != 0;
+        b->wheel_bad[c] = (uint8_t)(!bad ? 0u : b->wheel_bad[c] < 255u ? b->wheel_bad[c] + 1u : 255u);
+    }
+    if (b->state == TDMA_STATE_ARMED) {
+        guard(b);
+    }
+    send_streams(b);
+    b->tick++;
+    b->tick_due += BOARD_TICK_MS;
 }
 
 /* One thing whose time has come, watchdog first; false if there is none. */
@@ -969,7 +1184,7 @@ static bool run_due(struct board *b)
         return true;
     }
     if (b->streaming && reached(b->now, b->tick_due)) {
-        send_streams(b);
+        tick(b);
         return true;
     }
     return false;

@@ -15,8 +15,7 @@
 
 #define BOARD_OUT 128u        /* frames that one step can leave; more are dropped and counted */
 #define BOARD_TICK_MS 10u     /* the fastest stream, WHEEL_FB */
-#define BOARD_SLOT_MS 20u     /* servos get a new goal this often while they move ... */
-#define BOARD_HORIZON_MS 40u  /* ... and never one further ahead, should this code hang */
+#define BOARD_SLOT_MS 15u     /* servos get a new goal this often while they move */
 
 struct board_frame {
     uint16_t id;
@@ -42,6 +41,13 @@ struct board_config {
     uint16_t clutch_in_ms;
     uint16_t clutch_out_ms;
     uint16_t brake_ms;
+    uint16_t horizon_ms;         /* no servo goal lies further ahead, should this code hang */
+    uint16_t lowest_voltage;     /* 0.01 V; below it an armed board stops */
+    uint8_t hottest_coil;        /* CLUTCH_FB's raw value; above it likewise */
+    double window_counts;        /* wheel way over which it is compared with its servo's */
+    double follow;               /* a wheel that goes less of its way stands still */
+    uint8_t patience;            /* looks in a row at which a servo is silent or strained */
+    uint8_t bad_samples;         /* of an encoder in a row that are a fault */
 };
 
 extern const struct board_config board_config;
@@ -127,11 +133,16 @@ struct board {
     bool axial_turning;
     bool energised[TDMA_MAX_TENDONS]; /* coil has current */
     bool verified[TDMA_MAX_TENDONS];  /* both encoders saw the clutch coupled */
+    bool suspect[TDMA_MAX_TENDONS];   /* taken off in a hurry, nobody saw it come out */
     uint16_t staged; /* mask */
     int32_t staged_goal[TDMA_MAX_SERVOS];
 
     int32_t counts[TDMA_MAX_TENDONS]; /* wheels, whole turns included */
-    bool turns_known[TDMA_MAX_TENDONS];
+    bool turns_unknown[TDMA_MAX_TENDONS];
+    bool turns_open[TDMA_MAX_TENDONS]; /* a host may say them, until somebody arms */
+    uint8_t wheel_bits[TDMA_MAX_TENDONS]; /* enum board_wheel_status of the latest sample */
+    uint8_t wheel_bad[TDMA_MAX_TENDONS];  /* bad samples in a row */
+    uint8_t servo_silent[TDMA_MAX_SERVOS], servo_strained[TDMA_MAX_SERVOS]; /* looks in a row */
 
     uint8_t divider;
     bool streaming;
@@ -150,6 +161,8 @@ struct board {
     bool moving; /* servos are on a line from move_from to move_to */
     int32_t move_from[TDMA_MAX_SERVOS], move_to[TDMA_MAX_SERVOS];
     uint32_t move_begin, move_ms, move_fed;
+    bool comparing; /* wheels with their servos, from these marks on */
+    int32_t mark_servo[TDMA_MAX_SERVOS], mark_wheel[TDMA_MAX_SERVOS];
 };
 
 /* Power-up: silent and unarmed.

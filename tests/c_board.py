@@ -97,11 +97,17 @@ class Plant:
         self.servo = [0.0] * robot.tendons_per_segment
         self.displacements = displacements.tolist()
         self.slot: int | None = None  # where the drum stands
-        self.coils: dict[int, int] = {}  # tendon: when its coil was switched on
+        self.coils: dict[int, float] = {}  # tendon: when its plug began to move in
         self.released: dict[int, int] = {}  # tendon: when it was switched off; still coupled
-        self.status = [0] * robot.tendons_per_segment
+        self.jammed: set[int] = set()  # servos that do not turn
+        self.offline: set[int] = set()  # servos that do not answer either
+        self.wheel_bits = [0] * robot.n_tendons
+        self.stuck_wheels: dict[int, int] = {}  # tendon: counts that its encoder stays at
+        self.centivolts = 2400
+        self.dead_plugs: set[int] = set()  # tendons
+        self._mask = 0  # servos that were told to turn
         self._clutch_ms = round(physics.clutch_in_s * 1e3), round(physics.clutch_out_s * 1e3)
-        self._axial_ms = math.ceil(axial_time(robot, physics) * 1e3 - 1e-6)
+        self._axial_ms = math.ceil(axial_time(robot, physics, 0.0) * 1e3 - 1e-6)
         self._axial_due: int | None = None
         self._axial_goal = 0
         self._rate = [0.0] * len(self.servo)  # per ms
@@ -125,6 +131,8 @@ class Plant:
 
     def _turn_servos(self) -> None:
         for servo, rate in enumerate(self._rate):
+            if servo in self.jammed:
+                continue
             self.servo[servo] += rate
             tendon = self._met(servo)
             if tendon is not None and self._coupled(tendon):
@@ -144,12 +152,13 @@ class Plant:
         return round(self.servo[servo])
 
     def servo_status(self, _: None, servo: int) -> int:
-        return self.status[servo]
+        strained = servo in self.jammed and self._mask >> servo & 1 and self.now < self._until
+        return 8 if servo in self.offline else 4 * bool(strained)
 
     def servo_goals(self, _: None, mask: int, goals: list[int], within: int) -> None:
         for s, at in enumerate(self.servo):
             self._rate[s] = (goals[s] - at) / within if mask >> s & 1 and within else 0.0
-        self._until = self.now + within
+        self._until, self._mask = self.now + within, mask
 
     def servo_stop(self, _: None) -> None:
         self._until = self.now
@@ -173,7 +182,8 @@ class Plant:
     def clutch_coil(self, _: None, tendon: int, on: bool) -> None:
         assert self._axial_due is None or not on, "a plug would meet no slot"
         if on:
-            self.coils.setdefault(tendon, self.now)
+            never = tendon in self.dead_plugs
+            self.coils.setdefault(tendon, math.inf if never else self.now)
         elif tendon in self.coils:
             if self._coupled(tendon):
                 self.released[tendon] = self.now
@@ -183,16 +193,18 @@ class Plant:
         return 65
 
     def wheel_counts(self, tendon: int) -> int:
+        if tendon in self.stuck_wheels:
+            return self.stuck_wheels[tendon]
         return round(self.displacements[tendon] * self._counts_per_metre)
 
     def wheel_angle(self, _: None, tendon: int) -> int:
         return self.wheel_counts(tendon) % COUNTS_PER_TURN
 
     def wheel_status(self, _: None, tendon: int) -> int:
-        return 0
+        return self.wheel_bits[tendon]
 
     def voltage(self, _: None) -> int:
-        return 2400
+        return self.centivolts
 
     def tx_errors(self, _: None) -> int:
         return 0

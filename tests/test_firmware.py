@@ -28,7 +28,6 @@ from muxjax.hardware.protocol import (
     fingerprint_words,
 )
 from muxjax.robot import Robot
-from muxjax.tendons import displacement_range
 
 NAMES = [message.name for message in database().messages]
 SESSION = 77
@@ -192,7 +191,7 @@ def essence(received: Received) -> tuple:
 def sensible(twins: Twins, rng: np.random.Generator) -> tuple[int, int, int]:
     """What a host would do next, so that random commands come deep into the state machine."""
     board = twins.python
-    if board.state is not BoardState.ARMED or board.mechanics.slot < 0:
+    if board.state is not BoardState.ARMED or board.slot < 0:
         return Op.AXIAL, 0, int(rng.integers(1, len(twins.robot.axial_map) + 1))
     if board.staged:
         return Op.START, 0, sum(1 << servo for servo in board.staged)
@@ -216,8 +215,38 @@ def bits(robot: Robot, metres: float) -> int:
     return round(metres * float(robot.servo_per_metre) * SERVO_BITS_PER_RAD)
 
 
-DEEDS = {"sensible": 0.5, "wild": 0.2, "nonsense": 0.06, "repeat": 0.08, "far": 0.02,
-         "silence": 0.03, "disarm": 0.01, "arm": 0.1}  # fmt: skip
+def bend(twins: Twins, rng: np.random.Generator) -> None:
+    """A part fails, in both boards; or all are whole again."""
+    virtual, plant = twins.python, twins.c.plant
+    servo, wheel = int(rng.integers(0, 3)), int(rng.integers(0, 9))
+    virtual.mechanics.jammed.clear()
+    for faults in (virtual.senses.offline, virtual.senses.encoders.broken,
+                   virtual.senses.encoders.stuck, virtual.mechanics.dead_plugs,
+                   plant.jammed, plant.offline, plant.stuck_wheels, plant.dead_plugs):  # fmt: skip
+        faults.clear()
+    plant.wheel_bits = [0] * len(plant.wheel_bits)
+    virtual.volts, plant.centivolts = 24.0, 2400
+    kind = str(rng.choice(["none", "jam", "offline", "encoder", "stuck", "volts", "plug"]))
+    if kind in ("jam", "offline"):
+        virtual.mechanics.jam(servo)
+        plant.jammed.add(servo)
+    if kind == "offline":
+        virtual.senses.offline.add(servo)
+        plant.offline.add(servo)
+    elif kind == "encoder":
+        virtual.senses.encoders.broken[wheel] = plant.wheel_bits[wheel] = int(rng.integers(1, 4))
+    elif kind == "stuck":
+        virtual.senses.encoders.stuck[wheel] = virtual.senses.raw(wheel)
+        plant.stuck_wheels[wheel] = plant.wheel_counts(wheel)
+    elif kind == "volts":
+        virtual.volts, plant.centivolts = 12.0, 1200
+    elif kind == "plug":
+        virtual.mechanics.dead_plugs.add(wheel)
+        plant.dead_plugs.add(wheel)
+
+
+DEEDS = {"sensible": 0.5, "wild": 0.15, "nonsense": 0.04, "repeat": 0.06, "far": 0.02,
+         "silence": 0.03, "disarm": 0.02, "arm": 0.14, "bend": 0.04}  # fmt: skip
 
 
 def script(twins: Twins, rng: np.random.Generator, steps: int) -> Iterator[None]:
@@ -236,7 +265,7 @@ def script(twins: Twins, rng: np.random.Generator, steps: int) -> Iterator[None]
         elif deed == "wild":
             twins.command(*wild(twins, rng))
         elif deed == "nonsense":
-            op = int(rng.choice([0, *range(1, 11), 12, 13, 255]))
+            op = int(rng.choice([*range(14), 255]))
             idx, arg = int(rng.integers(0, 16)), int(rng.integers(-(2**23), 2**23))
             twins.command(op, idx, arg)
         elif deed == "repeat":
@@ -248,6 +277,8 @@ def script(twins: Twins, rng: np.random.Generator, steps: int) -> Iterator[None]
             twins.wait(0.4, beating=False)
         elif deed == "disarm":
             twins.command(Op.DISARM)
+        elif deed == "bend":
+            bend(twins, rng)
         else:
             twins.arm()
         twins.wait(float(rng.choice([0.002, 0.05, 0.25, 0.6, 3.0])), beating=True)
@@ -271,7 +302,7 @@ def test_both_boards_answer_random_commands_alike(library, muxarm, seed):
 
 
 def test_a_program_runs_on_the_c_board(library, muxarm):
-    target = 0.3 * displacement_range(muxarm)[:, 1] * np.array([1, -1, 0, 0.5, 0, -1, 1, 0, -0.5])
+    target = np.array([0.004, -0.006, 0, 0, 0, 0, 0.003, 0, 0])
     program = muxjax.schedule(muxarm, muxjax.plan(muxarm, muxjax.Problem(np.zeros(9), target)))
     link = LockstepLink(muxarm, stream_divider=10)
     board = CBoard(library, muxarm)
@@ -304,9 +335,9 @@ def test_c_board_feeds_its_servos_a_short_way_ahead(library, muxarm):
 
 
 def test_c_board_without_its_turns_arms_only_when_told(library, muxarm):
-    counts = 20000  # of wheel 2: one turn and a bit
+    counts = 20000  # of wheel 8: one turn and a bit
     start = np.zeros(9)
-    start[1] = counts * 2 * np.pi * float(muxarm.wheel_radius) / 16384
+    start[7] = counts * 2 * np.pi * float(muxarm.wheel_radius) / 16384
     board = CBoard(library, muxarm, start, turns_lost=True)
     port, ears, heard = Port("HOST"), Port("HOST"), []
 
@@ -322,7 +353,7 @@ def test_c_board_without_its_turns_arms_only_when_told(library, muxarm):
     for wheel in range(1, 10):
         refused = tell("CMD", Seq=2 * wheel + 4, Op=Op.ARM, Arg=SESSION).values
         assert (refused["Reason"], refused["Detail"]) == (Reason.TURNS_UNKNOWN, wheel)
-        turns = 1 if wheel == 2 else 0
+        turns = 1 if wheel == 8 else 0
         tell("CMD", Seq=2 * wheel + 5, Op=Op.TURNS, Arg=wheel << 16 | turns)
     tell("HOST_HB", Session=SESSION, Watchdog=150)
     assert tell("CMD", Seq=30, Op=Op.ARM, Arg=SESSION).values["Status"] == Status.DONE
@@ -331,7 +362,7 @@ def test_c_board_without_its_turns_arms_only_when_told(library, muxarm):
     beats = [h.values["Faults"] for h in heard if h.name == "BOARD_HB"]
     assert (beats[0] & 8, beats[-1] & 8) == (8, 0)
     turns = [
-        h.values["Turns2"] for h in heard if h.name == "WHEEL_TURNS" and h.values["Group"] == 0
+        h.values["Turns2"] for h in heard if h.name == "WHEEL_TURNS" and h.values["Group"] == 1
     ]
     assert turns[-1] == 1
 

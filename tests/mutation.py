@@ -82,7 +82,7 @@ def accidents_are_not_faults(bench: Bench) -> None:
         ),
     ):
         begin()
-        bench.wait(0.015)
+        bench.wait(0.0199)  # two looks
         end()
         bench.wait(0.2)
         bench.expect(bench.state is BoardState.ARMED, "an accident stopped the board")
@@ -93,6 +93,18 @@ def dead_servo_in_a_probe(bench: Bench) -> None:
     bench.go_to(1)
     bench.link.board.mechanics.jam(0)
     bench.ask(Op.ENGAGE, *bench.clutch(1, 1))
+    trips(bench, Reason.SERVO_STALLED, 1)
+
+
+def servo_that_stood_in_a_probe(bench: Bench) -> None:
+    """For too short a time to be a stall, but its probe proves nothing."""
+    bench.arm()
+    bench.go_to(1)
+    board = bench.link.board
+    bench.ask(Op.ENGAGE, *bench.clutch(1, 1))
+    bench.wait(board.physics.clutch_in_s + 0.012)
+    board.mechanics.jam(0)
+    board.plan(0.024, board.mechanics.jammed.clear)
     trips(bench, Reason.SERVO_STALLED, 1)
 
 
@@ -290,6 +302,7 @@ RULES: tuple[Callable[[Bench], None], ...] = (
     offline_servo,
     accidents_are_not_faults,
     dead_servo_in_a_probe,
+    servo_that_stood_in_a_probe,
     failed_encoder,
     unused_parts_may_fail,
     plug_jumps_out,

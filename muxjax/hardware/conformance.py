@@ -37,6 +37,7 @@ from muxjax.hardware.protocol import (
     Refusal,
     Status,
     fingerprint_words,
+    frame_crc,
 )
 from muxjax.hardware.sensors import Sensors
 from muxjax.hardware.virtual_board import RANGE_MARGIN_M, SEQUENCE_WINDOW
@@ -369,6 +370,11 @@ def silent_board_refuses_motion(bench: Bench) -> None:
     """Commands before HELLO are answered with NOT_ARMED."""
     if not bench.just_powered:
         raise Skipped("needs a board that was just switched on")
+    answer = bench.ask(Op.AXIAL, 0, 1, seq=0)
+    bench.expect(
+        answer[:2] == (Status.REJECTED, Reason.SEQUENCE),
+        f"number 0 after power-up: {_say(*answer[:2])}",
+    )
     for number, op in enumerate((Op.AXIAL, Op.ENGAGE, Op.RELEASE, Op.STAGE, Op.START), start=1):
         answer = bench.ask(op, 1, 1, seq=number)
         bench.expect(
@@ -472,10 +478,11 @@ def broken_frames_are_refused(bench: Bench) -> None:
     bench.greet()
     good = bench.port.pack("CMD", Seq=bench.seq + 1 & 0xFFFF, Op=Op.ROBOT, Idx=1, Arg=-1)
     broken = Frame(good.id, bytes([good.data[0] ^ 1]) + good.data[1:])
+    short = Frame(good.id, bytes([frame_crc(good.id, good.data[:7])]) + good.data[1:7])
     bench.wait(1.0, lambda: bench.refused_by_board is not None)
     before = bench.refused_by_board or 0
     bench.heard.clear()
-    bench.send(broken, Frame(good.id, good.data[:7]), Frame(0x7F0, good.data))
+    bench.send(broken, short, Frame(0x7F0, good.data))
     bench.wait(ANSWER_S)
     bench.expect(not _acks_heard(bench), "a broken frame was answered")
     bench.expect(bool(bench.faults & Fault.FRAMES_REFUSED), "no fault bit for refused frames")
@@ -651,6 +658,7 @@ def servo_moves_its_tendon(bench: Bench) -> None:
     other = 2 if bench.robot.tendons_per_segment > 1 else 0
     if other:
         bench.refuses(Op.STAGE, other, bench.servo_bits(other), Reason.NOT_COUPLED)
+        bench.refuses(Op.STAGE, other, SERVO_LIMIT_BITS + 1, Reason.NOT_COUPLED)
     bench.refuses(Op.START, 0, 1, Reason.NOT_STAGED)
     way = bench.way(tendon)
     bench.do(Op.STAGE, 1, bench.target(1, tendon, at + way))
@@ -735,8 +743,14 @@ def tendon_range_is_kept_at_the_start(bench: Bench) -> None:
     low, high = displacement_range(bench.robot)[other]
     bench.do(Op.STAGE, 1, bench.target(1, other, float(high if way > 0 else low)))
     bench.do(Op.RELEASE, *bench.clutch(there, 1), within=JOB_S)
+    if bench.robot.tendons_per_segment > 1:
+        bench.do(Op.ENGAGE, *bench.clutch(there, 2), within=JOB_S)
+        bench.do(Op.STAGE, 2, bench.servo_bits(2))
+        bench.do(Op.RELEASE, *bench.clutch(there, 2), within=JOB_S)
     bench.engage(here)
     before = bench.counts()
+    if bench.robot.tendons_per_segment > 1:
+        bench.refuses(Op.START, 0, 0b11, Reason.NOT_COUPLED)
     bench.refuses(Op.START, 0, 1, Reason.TENDON_RANGE)
     bench.stays(before, "a START beyond the range")
     bench.do(Op.STAGE, 1, bench.target(1, tendon, at))
@@ -835,7 +849,7 @@ def _estop(bench: Bench) -> None:
 
     bench.expect(bench.wait(ANSWER_S, confirmed), "ESTOP with a broken CRC was not taken")
     bench.expect(bool(bench.faults & Fault.ESTOP), "no fault bit for the ESTOP")
-    for op in (Op.HELLO, Op.ROBOT, Op.ARM, Op.DISARM, Op.AXIAL, Op.ENGAGE, Op.RELEASE,
+    for op in (Op.HELLO, Op.ROBOT, Op.TURNS, Op.ARM, Op.DISARM, Op.AXIAL, Op.ENGAGE, Op.RELEASE,
                Op.STAGE, Op.START):  # fmt: skip
         bench.refuses(op, 1, VERSION << 16 | bench.session, Reason.ESTOPPED)
     bench.expect(bench.state is BoardState.ESTOPPED, "the board left ESTOPPED by a command")

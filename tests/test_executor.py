@@ -12,9 +12,8 @@ import pytest
 import muxjax
 from muxjax.config import RobotConfig
 from muxjax.hardware import BusLink, LockstepLink, VirtualBoard, execute
-from muxjax.hardware.executor import MAX_TRIMS
-from muxjax.hardware.links import serve
 from muxjax.hardware.protocol import BoardState, Frame
+from muxjax.hardware.serving import BusWire, serve
 from muxjax.hardware.visits import load_visits, motions
 from muxjax.robot import Robot, robot_from_config
 from muxjax.scheduler import Instruction, Program
@@ -327,16 +326,33 @@ def test_gear_that_falls_short_is_trimmed_by_the_wheel(muxarm):
     assert link.board.mechanics.displacements == pytest.approx(np.array(made.target), abs=END_M)
 
 
-def test_gear_beyond_trimming_is_reported(muxarm):
+@pytest.mark.parametrize(
+    ("share", "move", "reason"),
+    [
+        (0.55, 0.001, "counts off after 3 trims"),
+        (0.6, 0.02, r"wheel moved 12.00 mm while servo 1 turned for 20.00 mm"),
+    ],
+)
+def test_gear_beyond_trimming_is_reported(muxarm, share, move, reason, monkeypatch):
+    monkeypatch.setattr("muxjax.hardware.transaction.MAX_TRIMS", 3)
     link = LockstepLink(muxarm)
-    link.board.mechanics._metres_per_rad *= 0.6
-    run = execute(program(muxarm, [visit(muxarm, 1, [{1: 0.02}])]), link)
-    assert not run.completed
-    assert f"counts off after {MAX_TRIMS} trims" in run.reason
+    link.board.mechanics._metres_per_rad *= share
+    run = execute(program(muxarm, [visit(muxarm, 1, [{1: move}])]), link)
+    assert (run.completed, run.resumable) == (False, False)
+    assert reason in run.reason
+    assert link.board.mechanics.displacements[0] <= move
 
 
-@pytest.mark.parametrize(("misses", "completed"), [(1, True), (2, True), (3, False)])
-def test_clutch_that_does_not_seat_is_tried_again(muxarm, misses, completed):
+@pytest.mark.parametrize(
+    ("misses", "reason", "failed"),
+    [
+        (1, "completed", ()),
+        (2, "completed", ()),
+        (3, "tries with servo 1, seated with servo 2: servo 1 is at fault", (1,)),
+        (9, "tries with servo 1, nor with servo 2: clutch or encoder of tendon 1", ()),
+    ],
+)
+def test_clutch_that_does_not_seat_is_tried_again(muxarm, misses, reason, failed):
     class Loose(dict):
         left = misses
 
@@ -348,10 +364,13 @@ def test_clutch_that_does_not_seat_is_tried_again(muxarm, misses, completed):
     link = LockstepLink(muxarm)
     link.board.mechanics.coupled = Loose()
     run = execute(program(muxarm, [visit(muxarm, 1, [{1: 0.01}])]), link)
-    assert run.completed is completed
-    if not completed:
-        assert run.reason == "instruction 1: clutches not seated after 3 tries"
-        assert not link.board.energised
+    assert run.completed is (misses < 3)
+    assert reason in run.reason
+    assert run.failed_servos == failed
+    assert not run.resumable
+    assert not link.board.energised
+    if not run.completed:
+        assert np.abs(link.board.mechanics.displacements).max() < 1e-12
 
 
 def test_over_a_python_can_bus(muxarm):
@@ -364,7 +383,7 @@ def test_over_a_python_can_bus(muxarm):
         can.Bus("muxjax-test", interface="virtual") as host,
         can.Bus("muxjax-test", interface="virtual") as far,
     ):
-        thread = threading.Thread(target=serve, args=(board, far, done.is_set))
+        thread = threading.Thread(target=serve, args=(board, BusWire(far), done.is_set))
         thread.start()
         try:
             run = execute(

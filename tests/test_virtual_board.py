@@ -89,7 +89,7 @@ class Bench:
     def engage(self, axial: int = 1) -> Bench:
         """Armed, at an axial position, servo 1 coupled to the tendon it meets there."""
         self.arm().do(Op.AXIAL, arg=axial, takes=3.0)
-        self.do(Op.ENGAGE, *self.clutch(axial), takes=0.3)
+        self.do(Op.ENGAGE, *self.clutch(axial), takes=1.0)
         return self
 
     def clutch(self, axial: int) -> tuple[int, int]:

@@ -1,6 +1,4 @@
-"""The command line.
-
-``muxjax bench | conformance | demo | firmware | fk | ik | plan | run | sweep | statics | task``
+"""The command line: ``muxjax bench | board | conformance | demo | firmware | fk | ik | plan | ...``.
 
 A person types and reads millimetres and degrees; ``--json`` prints SI units for a machine. The exit
 code is 0 on success, 1 where a pose was not reached or a run did not complete, 2 on bad input.
@@ -19,10 +17,12 @@ import jax
 import tyro
 
 from muxjax.cli.bench import bench
+from muxjax.cli.board import board
 from muxjax.cli.demo import demo
 from muxjax.cli.hardware import conformance, firmware
-from muxjax.cli.plans import plan, run
+from muxjax.cli.plans import plan
 from muxjax.cli.poses import fk, ik
+from muxjax.cli.runs import resume, run
 from muxjax.cli.statics import statics
 from muxjax.cli.sweep import sweep
 from muxjax.cli.task import task
@@ -31,12 +31,14 @@ from muxjax.planning import PlanningError
 
 COMMANDS: dict[str, Callable[..., Any]] = {
     "bench": bench,
+    "board": board,
     "conformance": conformance,
     "demo": demo,
     "firmware": firmware,
     "fk": fk,
     "ik": ik,
     "plan": plan,
+    "resume": resume,
     "run": run,
     "sweep": sweep,
     "statics": statics,

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-import json as json_module
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -12,6 +11,7 @@ from muxjax.cli.output import console, print_json
 from muxjax.hardware import BusLink, Link, LockstepLink, load_physics
 from muxjax.hardware.conformance import Finding, run_checks
 from muxjax.hardware.firmware import write_firmware
+from muxjax.hardware.links import open_bus
 from muxjax.robot import Robot, load_robot
 
 
@@ -50,7 +50,8 @@ def conformance(
     Example: muxjax conformance --bus '{"interface": "socketcan", "channel": "can0"}'
 
     Args:
-        bus: The bus as python-can's Bus takes it, in JSON; a virtual board in lockstep without it.
+        bus: Arguments of can.Bus as a JSON object, or a section of python-can's configuration; a
+            virtual board in lockstep without it.
         robot: Shipped robot or path of a YAML file.
         allow_motion: Make the checks that move the arm, too; let it hang free.
         just_powered: Nobody has spoken to the board since its power-up.
@@ -88,7 +89,5 @@ def _open(bus: str | None, arm: Robot) -> Iterator[Link]:
     if bus is None:
         yield LockstepLink(arm)
         return
-    import can
-
-    with can.Bus(**json_module.loads(bus)) as opened:
+    with open_bus(bus) as opened:
         yield BusLink(opened, arm)

@@ -1,28 +1,26 @@
-"""``muxjax plan`` and ``muxjax run``: a pose to a program, a program to the board."""
+"""``muxjax plan``: a pose to a program."""
 
 from __future__ import annotations
 
 import dataclasses
 import math
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Any, Literal
 
 import numpy as np
-import tyro
 from rich.table import Table
 
 from muxjax.cli.output import console, print_json, row_of
 from muxjax.cli.poses import Quaternion, Xyz, pose_argument
 from muxjax.config import TaskConfig, load_yaml, resolve
-from muxjax.hardware import LockstepLink, execute
 from muxjax.kinematics import check_configuration
 from muxjax.metrics import evaluate
 from muxjax.pipeline import PathPlan, PosePlan, plan_task, plan_to_pose
 from muxjax.planning import Plan, Problem
 from muxjax.planning import plan as plan_steps
-from muxjax.program_file import load_program, save_program
+from muxjax.program_file import save_program
 from muxjax.robot import Robot, load_robot
-from muxjax.scheduler import Program, check_same_robot, schedule
+from muxjax.scheduler import Program, schedule
 from muxjax.tendons import tendon_displacements
 
 Method = Literal[
@@ -65,7 +63,7 @@ def plan(
         json: Print JSON in SI units.
     """
     arm = load_robot(robot)
-    fields = _fields(arm, servos, preset, max_step_mm)
+    fields = problem_fields(arm, servos, preset, max_step_mm)
     if [xyz_mm, q_deg, poses].count(None) != 2:
         raise ValueError("plan: give either --xyz-mm (a pose), --q-deg or --poses")
     if xyz_mm is None and (rpy_deg is not None or quat is not None):
@@ -74,12 +72,12 @@ def plan(
         task = load_yaml(TaskConfig, resolve(poses, "tasks"))
         return _report_path(arm, task, plan_task(arm, task, method=method, **fields), out, json)
     if xyz_mm is None:
-        return _report_plan(arm, _plan_to(arm, q_deg, method, fields), None, out, json)
+        return _report_plan(arm, plan_to_configuration(arm, q_deg, method, fields), None, out, json)
     choice = plan_to_pose(arm, pose_argument(xyz_mm, rpy_deg, quat), method=method, **fields)
     return _report_plan(arm, choice.plan, choice, out, json)
 
 
-def _plan_to(
+def plan_to_configuration(
     arm: Robot, q_deg: tuple[float, ...] | None, method: Method, fields: dict[str, Any]
 ) -> Plan:
     """Plan from the straight arm to a configuration [degrees]."""
@@ -88,7 +86,7 @@ def _plan_to(
     return plan_steps(arm, problem, method)
 
 
-def _fields(
+def problem_fields(
     arm: Robot, servos: tuple[int, ...] | None, preset: str, max_step_mm: float | None
 ) -> dict[str, Any]:
     """Fields of ``Problem`` that the command line chooses."""
@@ -199,76 +197,3 @@ def _print_program(program: Program) -> None:
         clutches = " ".join(map(str, item.clutches))
         table.add_row(str(number), str(item.axial), clutches, moves, turns)
     console.print(table)
-
-
-def run(
-    program: Annotated[Path | None, tyro.conf.Positional] = None,
-    xyz_mm: Xyz | None = None,
-    rpy_deg: Xyz | None = None,
-    quat: Quaternion | None = None,
-    q_deg: tuple[float, ...] | None = None,
-    servos: tuple[int, ...] | None = None,
-    planner: Method = "exact",
-    preset: str = "paper",
-    max_step_mm: float | None = None,
-    robot: str = "muxarm",
-    json: bool = False,
-) -> int:
-    """Execute a program, or plan to a pose and execute that, on the virtual board, in lockstep.
-
-    Examples: muxjax run program.json; muxjax run --planner learned --q-deg 60 0 75 180 40 0
-
-    Args:
-        program: File written by muxjax plan --out.
-        xyz_mm: Instead of a program: tool position in the world [mm].
-        rpy_deg: Roll, pitch, yaw [degrees]; upright by default.
-        quat: Orientation as a quaternion w x y z instead.
-        q_deg: Bending angle and azimuth of each segment [degrees], instead of a pose.
-        servos: Available servos, for the plan; all by default.
-        planner: Method of the plan.
-        preset: Weights of its cost: paper, fastest, no-overshoot, or a YAML file.
-        max_step_mm: Greatest tendon displacement in one of its steps [mm]; no limit by default.
-        robot: Shipped robot or path of a YAML file; a program runs only on its own robot.
-        json: Print JSON in SI units.
-    """
-    if [program, xyz_mm, q_deg].count(None) != 2:
-        raise ValueError("run: give either a program file, --xyz-mm (a pose) or --q-deg")
-    if xyz_mm is None and (rpy_deg is not None or quat is not None):
-        raise ValueError("run: only --xyz-mm takes --rpy-deg or --quat")
-    arm = load_robot(robot)
-    if program is not None:
-        loaded = load_program(program)
-    else:
-        fields = _fields(arm, servos, preset, max_step_mm)
-        if xyz_mm is None:
-            found = _plan_to(arm, q_deg, planner, fields)
-        else:
-            pose = pose_argument(xyz_mm, rpy_deg, quat)
-            found = plan_to_pose(arm, pose, method=planner, **fields).plan
-        loaded = schedule(arm, found)
-    check_same_robot(arm, loaded)
-    link = LockstepLink(arm, displacements=loaded.start, axial=loaded.axial)
-    done = execute(loaded, link)
-    error = np.abs(done.measured - np.array(loaded.target))
-    if json:
-        print_json(
-            {
-                "robot": arm.config.name,
-                "completed": done.completed,
-                "reason": done.reason,
-                "duration_s": done.duration_s,
-                "measured_m": done.measured,
-                "largest_error_m": float(np.max(error)),
-                "instructions": [dataclasses.asdict(r) for r in done.records],
-            }
-        )
-        return 0 if done.completed else 1
-    table = Table("stage", "axial", "begin [s]", "end [s]", "trims")
-    for number, r in enumerate(done.records, start=1):
-        table.add_row(str(number), str(r.axial), f"{r.start_s:.2f}", f"{r.end_s:.2f}", str(r.trims))
-    console.print(table)
-    console.print(
-        f"{done.reason}: {done.duration_s:.2f} s on the board's clock, wheels within "
-        f"{1e3 * np.max(error):.3f} mm of the target"
-    )
-    return 0 if done.completed else 1

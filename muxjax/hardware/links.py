@@ -2,15 +2,18 @@
 
 ``LockstepLink`` runs a virtual board in this process on a virtual clock: no set-up, far faster
 than real time, and the same run every time. ``BusLink`` speaks over any python-can bus, in real
-time; ``serve`` is the virtual board at the other end of such a bus.
+time.
 """
 
 from __future__ import annotations
 
+import json
+import logging
 import secrets
 import time
-from collections.abc import Callable, Collection, Iterable
-from typing import TYPE_CHECKING, Protocol
+from collections import Counter
+from collections.abc import Collection, Iterable
+from typing import TYPE_CHECKING, Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float
@@ -26,7 +29,11 @@ from muxjax.scheduler import Trajectory
 if TYPE_CHECKING:
     import can
 
+AT_ONCE = 64  # frames taken from a bus before the executor looks at them
+ERROR_PAUSE_S = 0.001
 
+
+@runtime_checkable
 class Link(Protocol):
     """What ``execute`` needs of a way to a board."""
 
@@ -136,16 +143,24 @@ def check_divider(stream_divider: int) -> int:
 class BusLink:
     """A board on a python-can bus, in real time.
 
+    What the bus raises counts as frames that were lost: whether the board is still there, its
+    heartbeat says, and nothing else. (A corrupt slcan line raises in ``recv``; a socketcand
+    server that died makes ``recv`` return None for ever.)
+
     Args:
         bus: An open python-can bus; the caller closes it. The executor owns its receive loop, so
             no Notifier may read from it.
         robot: The arm at the other end; the board refuses another one.
         stream_divider: As for ``LockstepLink``; for slow serial links.
+
+    Attributes:
+        errors: What the bus has raised so far, counted by its text.
     """
 
     def __init__(self, bus: can.BusABC, robot: Robot, stream_divider: int = 1) -> None:
         self.robot = robot
         self.stream_divider = check_divider(stream_divider)
+        self.errors: Counter[str] = Counter()
         self._bus = bus
 
     @property
@@ -159,38 +174,70 @@ class BusLink:
 
     def send(self, frames: Iterable[Frame]) -> None:
         """Put frames on the bus."""
-        _send(self._bus, frames)
+        try:
+            send_frames(self._bus, frames)
+        except _bus_errors() as error:
+            self.errors[repr(error)] += 1
 
     def wait(self, until: float) -> list[Frame]:
-        """One frame, or none by ``until`` [s]."""
-        return _receive(self._bus, until - self.now)
+        """The frames that are there, or the first one to come by ``until`` [s]."""
+        try:
+            return receive_frames(self._bus, until - self.now)
+        except _bus_errors() as error:
+            self.errors[repr(error)] += 1
+            time.sleep(ERROR_PAUSE_S)  # a bus that is gone raises at once, and for ever
+            return []
 
     def trajectory(self, since: float) -> None:
         """Nobody sees the truth of a real arm."""
         return
 
 
-def serve(board: VirtualBoard, bus: can.BusABC, until: Callable[[], bool]) -> None:
-    """Be the board on a python-can bus, in real time, until ``until()`` says so."""
-    begin = time.monotonic()
-    while not until():
-        now = time.monotonic() - begin
-        frames = _receive(bus, min(board.next_time - now, 0.01))
-        _send(bus, board.step(time.monotonic() - begin, frames))
+def open_bus(spec: str) -> can.BusABC:
+    """A python-can bus, from the arguments of ``can.Bus`` or from python-can's configuration.
+
+    Args:
+        spec: A JSON object of arguments, such as ``{"interface": "socketcand", "host":
+            "127.0.0.1", "port": 29536, "channel": "can0"}``; or the name of a section of
+            python-can's configuration file.
+
+    Raises:
+        ValueError: Not JSON, no such section, or an interface that cannot be opened.
+    """
+    import can
+
+    # socketcand warns of every message that TCP has cut in two, though it mends that itself.
+    logging.getLogger("can").setLevel(logging.ERROR)
+    try:
+        if spec.lstrip().startswith("{"):
+            return can.Bus(**json.loads(spec))
+        return can.Bus(config_context=spec)
+    except (can.CanError, TypeError, ValueError) as error:
+        raise ValueError(f"bus: {spec} cannot be opened: {error}") from error
 
 
-def _send(bus: can.BusABC, frames: Iterable[Frame]) -> None:
+def _bus_errors() -> tuple[type[Exception], ...]:
+    """What python-can raises for a bad line, an adapter that is gone, a full queue."""
+    import can
+
+    return can.CanError, OSError, ValueError, IndexError
+
+
+def send_frames(bus: can.BusABC, frames: Iterable[Frame]) -> None:
+    """Put frames on a python-can bus."""
     import can
 
     for frame in frames:
         bus.send(can.Message(arbitration_id=frame.id, data=frame.data, is_extended_id=False))
 
 
-def _receive(bus: can.BusABC, timeout: float) -> list[Frame]:
-    """One data frame of the kind the protocol uses, if one arrives in time [s]."""
+def receive_frames(bus: can.BusABC, timeout: float) -> list[Frame]:
+    """Data frames of the kind the protocol uses: those there, or the first one in time [s]."""
+    frames: list[Frame] = []
     message = bus.recv(max(0.0, timeout))
-    if message is None or message.is_extended_id or message.is_fd:
-        return []
-    if message.is_error_frame or message.is_remote_frame:
-        return []
-    return [Frame(message.arbitration_id, bytes(message.data))]
+    while message is not None:
+        other = message.is_extended_id or message.is_fd
+        if not (other or message.is_error_frame or message.is_remote_frame):
+            frames.append(Frame(message.arbitration_id, bytes(message.data)))
+        message = bus.recv(0.0) if len(frames) < AT_ONCE else None
+    return frames

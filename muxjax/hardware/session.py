@@ -5,7 +5,9 @@ Written as scripts: generators that wait by yielding the time at which to go on 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Generator, Mapping
+from collections.abc import Callable, Collection, Generator, Mapping
+from enum import Enum
+from itertools import count
 from typing import Any, TypeVar
 
 from muxjax.hardware.protocol import (
@@ -27,6 +29,7 @@ Script = Generator[float, None, T]  # yields when to wake up at the latest [s]
 RETRY_S = 0.030  # an unanswered command is sent again after this
 TRIES = 5
 SENSOR_WAIT_S = 1.0  # longest wait for feedback: SERVO_FB's 25 Hz, divided by 20
+BUSY_S = 1.0  # a board that comes to rest or waits for a heartbeat is asked again for so long
 PATIENCE_S = 1.0  # beyond what a job should take, while the board says that it is at it
 
 ANOTHER_BOARD = {
@@ -35,12 +38,54 @@ ANOTHER_BOARD = {
 }
 
 
+class After(Enum):
+    """What can be done after a failure."""
+
+    AGAIN = 1  # a new session may go on at once
+    RESUME = 2  # a person looks first; then ``resume`` goes on
+    REPAIR = 3  # a part is to be repaired, or left out of a new plan, first
+
+
 class Failed(Exception):  # noqa: N818 - a way out of the script, never seen outside
-    """The run cannot go on; the board is to be left in the safe state."""
+    """The session cannot go on; the board is to be left in the safe state.
+
+    Args:
+        text: What happened.
+        after: What can be done now.
+        reason: The board's reason, if it gave one.
+        servo: The servo that failed, from 1; 0 if none is to blame.
+    """
+
+    def __init__(
+        self,
+        text: str,
+        after: After = After.AGAIN,
+        *,
+        reason: Reason = Reason.NONE,
+        servo: int = 0,
+    ) -> None:
+        super().__init__(text)
+        self.after, self.reason, self.servo = after, reason, servo
 
 
 class Wrong(Failed):
     """The run must not begin: the caller asked for something the board is not there for."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__(text, After.REPAIR)
+
+
+# What a reason of the board leaves open; the others may be gone in a new session.
+AFTER = {
+    Reason.UNKNOWN_OP: After.REPAIR,
+    Reason.ESTOPPED: After.RESUME,
+    Reason.SERVO_RANGE: After.REPAIR,
+    Reason.TENDON_RANGE: After.REPAIR,
+    Reason.NOT_RELEASED: After.REPAIR,
+    Reason.SERVO_STALLED: After.REPAIR,
+    Reason.SERVO_OFFLINE: After.REPAIR,
+    Reason.ENCODER_FAULT: After.REPAIR,
+}
 
 
 class Session:
@@ -79,8 +124,6 @@ class Session:
         name, values = received
         if name == "ACK":
             self._receive_ack(values)
-        elif name == "EMCY":
-            self.sensors.emergency = Reason(values["Code"])
         else:
             self.sensors.update(self._now, name, values)
 
@@ -107,12 +150,25 @@ class Session:
             yield deadline
         return True
 
-    def _expect(self, condition: Callable[[], bool], what: str) -> Script[None]:
+    def _expect(self, condition: Callable[[], bool], what: str | Callable[[], str]) -> Script[None]:
+        """Wait for the sensors to say something; what it is may be known only afterwards."""
         if not (yield from self._until(condition, SENSOR_WAIT_S)):
-            raise Failed(f"waited {SENSOR_WAIT_S:g} s for {what}")
+            raise Failed(
+                f"waited {SENSOR_WAIT_S:g} s for {what if isinstance(what, str) else what()}"
+            )
+
+    def _pause(self, seconds: float) -> Script[None]:
+        """Let time pass."""
+        yield from self._until(lambda: False, seconds)
 
     def _command(
-        self, op: Op, idx: int = 0, arg: int = 0, *, takes_s: float = 0.0
+        self,
+        op: Op,
+        idx: int = 0,
+        arg: int = 0,
+        *,
+        takes_s: float = 0.0,
+        may: Collection[Reason] = (),
     ) -> Script[Reason]:
         """Send a command until it is answered, and wait until it is done.
 
@@ -121,17 +177,13 @@ class Session:
             idx: As the opcode defines it.
             arg: Likewise.
             takes_s: How long its job should take [s]; after that the board is asked again.
+            may: Reasons not to do it that the caller can mend.
 
         Returns:
-            NONE, or NOT_SEATED, which the caller can mend.
+            NONE, or one of ``may``.
         """
         self._seq, self._ack = (self._seq + 1) & 0xFFFF, None
-        for _ in range(TRIES):
-            self._send("CMD", Seq=self._seq, Op=op, Idx=idx, Arg=arg)
-            if (yield from self._until(lambda: self._answered, RETRY_S)):
-                break
-        else:
-            raise Failed(f"{op.name}: no answer after {TRIES} tries")
+        yield from self._ask(op, idx, arg)
         yield from self._until(lambda: self._ended, takes_s + RETRY_S)
         deadline = self._now + takes_s + PATIENCE_S
         while not self._ended:
@@ -139,7 +191,19 @@ class Session:
                 raise Failed(f"{op.name}: accepted, but never done")
             self._send("CMD", Seq=self._seq, Op=op, Idx=idx, Arg=arg)
             yield from self._until(lambda: self._ended, RETRY_S)
-        return self._verdict(op)
+        return self._verdict(op, may)
+
+    def _ask(self, op: Op, idx: int, arg: int) -> Script[None]:
+        """Send a command until it is taken or refused."""
+        deadline = self._now + BUSY_S
+        for sent in count():
+            if sent >= TRIES and self._ack is None:
+                raise Failed(f"{op.name}: no answer after {TRIES} tries")
+            if self._now >= deadline:
+                raise Failed(f"{op.name}: the board was busy for {BUSY_S:g} s")
+            self._send("CMD", Seq=self._seq, Op=op, Idx=idx, Arg=arg)
+            if (yield from self._until(lambda: self._answered, RETRY_S)):
+                return
 
     @property
     def _answered(self) -> bool:
@@ -149,12 +213,12 @@ class Session:
     def _ended(self) -> bool:
         return self._ack is not None and self._ack[0] not in (Status.BUSY, Status.ACCEPTED)
 
-    def _verdict(self, op: Op) -> Reason:
+    def _verdict(self, op: Op, may: Collection[Reason]) -> Reason:
         assert self._ack is not None  # callers wait for _ended
         status, reason = self._ack
-        if status is Status.DONE or reason is Reason.NOT_SEATED:
+        if status is Status.DONE or reason in may:
             return reason
         text = f"{op.name} {status.name.lower()} by the board: {reason.name}"
         if reason in ANOTHER_BOARD:
             raise Wrong(f"{text}; {ANOTHER_BOARD[reason]}")
-        raise Failed(text)
+        raise Failed(text, AFTER.get(reason, After.AGAIN), reason=reason)

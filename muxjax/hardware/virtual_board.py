@@ -24,7 +24,7 @@ from jaxtyping import Float
 from muxjax.hardware import feedback, upsets
 from muxjax.hardware.coils import Coils
 from muxjax.hardware.commands import HANDLERS, Job, come_to_rest
-from muxjax.hardware.encoders import EncoderCalibration, Encoders
+from muxjax.hardware.encoders import COUNTS_PER_RAD, EncoderCalibration, Encoders
 from muxjax.hardware.faults import FaultClock, FaultConfig, FaultKind
 from muxjax.hardware.guards import FAULTS, WINDOW_COUNTS, Guards, Trip
 from muxjax.hardware.interlocks import refusal
@@ -101,7 +101,8 @@ class VirtualBoard:
         self.guards = Guards()
         self.volts = self.physics.supply_v
         self.limits = displacement_range(robot) + np.array([-RANGE_MARGIN_M, RANGE_MARGIN_M])
-        self.window_counts = WINDOW_COUNTS
+        play = self.physics.servo.backlash_m / float(robot.wheel_radius) * COUNTS_PER_RAD
+        self.window_counts = WINDOW_COUNTS + 2 * play  # in which a wheel must follow its servo
         self.facing = robot.axial_map.tolist()  # tendon that each servo meets, [slot][servo]
         self.words = fingerprint_words(robot.fingerprint)
         self.cut_off: set[FaultKind] = set()  # what keeps frames from the board

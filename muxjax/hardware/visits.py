@@ -66,7 +66,7 @@ def load_visits(robot: Robot, program: Program) -> tuple[Visit, ...]:
             legs.append(goals)
         if legs:
             held = after
-        visits.append(_visit(robot, instruction.axial, tendons, tuple(legs)))
+        visits.append(make_visit(robot, instruction.axial, tendons, tuple(legs)))
     host_array("program.target", program.target, last=robot.n_tendons)
     return tuple(visits)
 
@@ -94,9 +94,10 @@ def motions(instruction: Instruction) -> tuple[Mapping[int, float], ...]:
     return tuple(dict(zip(servos, point.tolist(), strict=True)) for point in kept)
 
 
-def _visit(
+def make_visit(
     robot: Robot, axial: int, tendons: Mapping[int, int], legs: tuple[Mapping[int, float], ...]
 ) -> Visit:
+    """Visit of an axial position at which servos meet these tendons, {servo: tendon}."""
     per_layer = robot.tendons_per_segment
     layer = int(robot.axial_map[axial - 1, 0]) // per_layer + 1
     mask = sum(1 << ((c - 1) % per_layer) for c in tendons.values())

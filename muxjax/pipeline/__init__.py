@@ -3,7 +3,7 @@
 pose -> q (ik) -> l (tendons) -> Plan (planning) -> Program (scheduler) -> frames (hardware)
 """
 
-from muxjax.pipeline.faults import Stranded, replan, without_axial_motor
+from muxjax.pipeline.faults import Stranded, replan, run_to_target, without_axial_motor
 from muxjax.pipeline.paths import PathPlan, plan_path, plan_task
 from muxjax.pipeline.poses import (
     Alternative,
@@ -30,6 +30,7 @@ __all__ = [
     "problem_for_pose",
     "replan",
     "run_task",
+    "run_to_target",
     "target_pose",
     "without_axial_motor",
 ]

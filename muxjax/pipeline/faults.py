@@ -15,11 +15,13 @@ import numpy as np
 from jaxtyping import Float
 from scipy.optimize import least_squares
 
-from muxjax.hardware import Run
+from muxjax.hardware import Link, MemoryJournal, Run, execute, resume
+from muxjax.hardware.executor import OnProgress
 from muxjax.kinematics import check_configuration
-from muxjax.planning import Plan, Problem, plan
+from muxjax.planning import Plan, PlanningError, Problem, plan
 from muxjax.precision import host_array
 from muxjax.robot import Robot
+from muxjax.scheduler import Program, schedule
 from muxjax.tendons import (
     bending_from_displacements,
     check_displacements,
@@ -68,6 +70,69 @@ def replan(
     tolerance = max(fields.pop("tolerance", 0.0), _COUNTS_LEFT_ALONE * count)
     problem = Problem(measured, target, servos=servos, axial=axial, tolerance=tolerance, **fields)
     return plan(robot, problem, method)
+
+
+def run_to_target(
+    link: Link,
+    journal: MemoryJournal,
+    program: Program | None = None,
+    *,
+    method: str = "exact",
+    on_progress: OnProgress | None = None,
+    **fields: Any,
+) -> Run:
+    """Run a program to its target, planning anew without each servo that fails on the way.
+
+    Args:
+        link: The way to the board.
+        journal: Of this run, or of the one to go on with.
+        program: What to run; None to go on with the journal's.
+        method: Planner.
+        on_progress: As for ``execute``.
+        **fields: Other fields of ``Problem`` for the new plans, such as ``world``.
+
+    Returns:
+        The last run. If it is not completed, something else than a servo has stopped it, or no
+        servo is left.
+
+    Raises:
+        ValueError: See ``execute`` and ``resume``.
+        PlanningError: There is no way on with the servos that are left.
+    """
+    if (
+        program is None
+        and (program := _without_failed(link.robot, journal, method, fields)) is None
+    ):
+        run = resume(journal, link, on_progress=on_progress)
+    else:
+        run = execute(program, link, journal=journal, on_progress=on_progress)
+    while not run.completed:
+        program = _without_failed(link.robot, journal, method, fields)
+        if program is None:
+            break
+        run = execute(program, link, journal=journal, on_progress=on_progress)
+    return run
+
+
+def _without_failed(
+    robot: Robot, journal: MemoryJournal, method: str, fields: dict[str, Any]
+) -> Program | None:
+    """On from where the journal's wheels are, with the servos that are left.
+
+    None if none of the program's has failed, or all have.
+    """
+    now = journal.standing
+    if now.program is None:
+        return None
+    left = tuple(s for s in now.program.servos if s not in now.failed_servos)
+    if not left or left == now.program.servos:
+        return None
+    measured = np.array(now.lengths, dtype=np.float64)
+    target = np.array(now.program.target)
+    found = replan(robot, measured, target, servos=left, method=method, **fields)
+    if found.status == "failed":
+        raise PlanningError(f"{method}: without servos {now.failed_servos}: {found.reason}")
+    return schedule(robot, found)
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,0 +1,66 @@
+"""Every frame of a run in a file, as ``candump -L`` writes it."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable
+from pathlib import Path
+
+from muxjax.hardware.links import Link
+from muxjax.hardware.protocol import Frame
+from muxjax.scheduler import Trajectory
+
+
+class LoggedLink:
+    """A link whose frames are also written to a file.
+
+    They are with the system as soon as they were sent or received, so the file survives a killed
+    process. python-can, SavvyCAN and cantools (``cantools decode``, with protocol.dbc) read it.
+
+    Args:
+        link: The link.
+        path: Of the file, which grows if it exists.
+        begin_s: Time in the file at the zero of the link's clock [s]; for a link in real time,
+            ``time.time() - link.now``.
+    """
+
+    def __init__(self, link: Link, path: str | Path, begin_s: float = 0.0) -> None:
+        self.robot = link.robot
+        self.stream_divider = link.stream_divider
+        self._link, self._begin = link, begin_s
+        self._file = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o644)
+
+    @property
+    def now(self) -> float:
+        """As of the link."""
+        return self._link.now
+
+    def new_session(self) -> int:
+        """As of the link."""
+        return self._link.new_session()
+
+    def send(self, frames: Iterable[Frame]) -> None:
+        """Write the frames down, then send them."""
+        frames = list(frames)
+        self._write(frames, "T")
+        self._link.send(frames)
+
+    def wait(self, until: float) -> list[Frame]:
+        """As of the link."""
+        frames = self._link.wait(until)
+        self._write(frames, "R")
+        return frames
+
+    def trajectory(self, since: float) -> Trajectory | None:
+        """As of the link."""
+        return self._link.trajectory(since)
+
+    def close(self) -> None:
+        """Close the file."""
+        os.close(self._file)
+
+    def _write(self, frames: list[Frame], way: str) -> None:
+        at = self._begin + self.now
+        lines = (f"({at:.6f}) can0 {f.id:03X}#{f.data.hex().upper()} {way}\n" for f in frames)
+        if text := "".join(lines):
+            os.write(self._file, text.encode())

@@ -1,0 +1,178 @@
+"""One run of a campaign: a host, an operator who puts things right, and the judge's verdict."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from muxjax.hardware import LockstepLink, MemoryJournal, Run
+from muxjax.hardware.faults import FaultKind
+from muxjax.hardware.protocol import BoardState, Frame
+from muxjax.pipeline import run_to_target
+from muxjax.robot import Robot
+from muxjax.scheduler import Program, waypoints
+from tests.campaigns.judge import Judge
+from tests.campaigns.scenario import Scenario
+
+END_M = 2e-5  # of measured wheel length
+RETURNS = 8  # how often the operator lets a run go on
+AGAIN_M = 1e-3  # way of a tendon beyond its program, each time that its clutch engages
+RANGE_M = 1.2e-3  # slip at a clutch, and the encoder's error
+BOOT_S = 2.0
+COOLING_S = 300.0
+TO_WAIT_FOR = ("coils", "supply")  # refusals that pass
+
+
+class HostKilled(Exception):  # noqa: N818 - no error, an event
+    """The host's process is gone."""
+
+
+class MortalLink(LockstepLink):
+    """A link whose host is killed at certain times.
+
+    Attributes:
+        kills: Times left [s].
+    """
+
+    kills: tuple[float, ...] = ()
+
+    def wait(self, until: float) -> list[Frame]:
+        """As ever, unless the host does not live to see it."""
+        if self.kills and self.kills[0] <= until:
+            at, self.kills = self.kills[0], self.kills[1:]
+            super().wait(max(at, self.now))
+            raise HostKilled
+        return super().wait(until)
+
+
+@dataclass
+class Verdict:
+    """What became of a scenario.
+
+    Attributes:
+        seed: Of the scenario.
+        ending: "completed", "safe", or "wrong".
+        offences: What must not be, in words.
+        reason: Of the last run.
+        steps: How the host came to its end.
+        measured_mm: Largest distance of a wheel from its goal, by a fresh look at the sensors.
+        true_mm: The same of the true tendon.
+        simulated_s: Time on the virtual clock.
+    """
+
+    seed: int
+    ending: str = "wrong"
+    offences: list[str] = field(default_factory=list)
+    reason: str = ""
+    steps: list[str] = field(default_factory=list)
+    measured_mm: float = math.nan
+    true_mm: float = math.nan
+    simulated_s: float = 0.0
+
+
+def run(robot: Robot, scenario: Scenario) -> Verdict:
+    """Play a scenario to its end and judge it."""
+    program = scenario.program
+    link = MortalLink(
+        robot,
+        scenario.physics,
+        program.start,
+        scenario.axial,
+        scenario.stream_divider,
+        scenario.faults,
+        scenario.seed,
+    )
+    link.kills = scenario.kills
+    judge = Judge(link.board, RANGE_M)
+    verdict = Verdict(scenario.seed)
+    last = _host(scenario, link, verdict)
+    link.kills = ()
+    _pass(link, 1.0)
+    verdict.simulated_s = link.now
+    verdict.offences += judge.offences.values()
+    _judge_end(scenario, link, judge, last, verdict)
+    return verdict
+
+
+def _host(scenario: Scenario, link: MortalLink, verdict: Verdict) -> Run | None:
+    """Begin, and go on until it is done or nobody can: the last run, None if it was refused."""
+    journal = MemoryJournal()
+    last: Run | None = None
+    for _ in range(RETURNS):
+        begun = journal.standing.program is not None
+        try:
+            last = run_to_target(link, journal, None if begun else scenario.program)
+        except HostKilled:
+            verdict.steps.append(f"{link.now:.2f} s: host killed")
+            _operator(link)
+            continue
+        except ValueError as refused:
+            verdict.steps.append(f"{link.now:.2f} s: refused: {refused}")
+            verdict.reason, last = str(refused), None
+            if not str(refused).startswith(TO_WAIT_FOR):
+                return None
+            _operator(link)
+            continue
+        verdict.steps.append(f"{link.now:.2f} s: {last.reason}; failed {last.failed_servos}")
+        verdict.reason = last.reason
+        if last.completed or not last.resumable:
+            return last
+        _operator(link)
+    return last
+
+
+def _operator(link: MortalLink) -> None:
+    """Waits; switches a board off and on that is cut off for good or latched."""
+    kills, link.kills = link.kills, ()
+    _pass(link, 0.5)
+    board = link.board
+    if FaultKind.BUS_OFF in board.cut_off or board.state is BoardState.ESTOPPED:
+        board.power_cycle()
+    _pass(link, BOOT_S)
+    if board.coils.temperature > board.physics.coil.limit_c:
+        _pass(link, COOLING_S)
+    link.kills = tuple(t for t in kills if t > link.now)
+
+
+def _pass(link: MortalLink, seconds: float) -> None:
+    """Let time pass without a host."""
+    end = link.now + seconds
+    while link.now < end:
+        link.wait(end)
+
+
+def _judge_end(
+    scenario: Scenario, link: MortalLink, judge: Judge, last: Run | None, verdict: Verdict
+) -> None:
+    goals, board = np.array(scenario.program.target), link.board
+    samples = []
+    for _ in range(16):  # a fresh look with the sensors' noise averaged out
+        _pass(link, 0.01)
+        samples.append(board.senses.displacements())
+    measured = np.mean(samples, axis=0)
+    verdict.measured_mm = 1e3 * float(np.abs(measured - goals).max())
+    verdict.true_mm = 1e3 * float(np.abs(board.mechanics.displacements - goals).max())
+    if not judge.at_rest and not board.mechanics.stuck_plugs:
+        verdict.offences.append(f"not at rest at the end, in state {board.state.name}")
+    allowed = _ways(board.robot, scenario.program) + AGAIN_M * judge.engaged
+    twice = judge.travel - allowed
+    if twice.max() > 0 and FaultKind.ENCODER_STUCK not in scenario.lasting:
+        tendon = int(twice.argmax()) + 1
+        verdict.offences.append(f"tendon {tendon} moved {1e3 * twice.max():.2f} mm too much")
+    if last is not None and last.completed:
+        verdict.ending = "completed"
+        if verdict.measured_mm > 1e3 * END_M:
+            verdict.offences.append(f"completed {verdict.measured_mm:.4f} mm off")
+        return
+    if any(word in verdict.reason for word in scenario.true_reasons):
+        verdict.ending = "safe"
+    else:
+        kinds = ", ".join(scenario.lasting) or "nothing lasting"
+        verdict.offences.append(f"did not complete, although {kinds} was broken")
+
+
+def _ways(robot: Robot, program: Program) -> np.ndarray:
+    """How far each tendon goes in a program [m]."""
+    return sum(np.abs(np.diff(points, axis=0)).sum(axis=0) for points in waypoints(robot, program))

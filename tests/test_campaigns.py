@@ -1,0 +1,130 @@
+"""A short campaign; the judge sees what it is there for.
+
+The long one: ``python -m tests.campaigns --runs 10000 --seed 0 --workers 2``.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from test_virtual_board import SESSION, Bench
+
+from muxjax.hardware.faults import FaultKind
+from muxjax.hardware.protocol import Op, Port
+from tests.campaigns.campaign import run
+from tests.campaigns.judge import Judge
+from tests.campaigns.scenario import LASTING, PASSING, draw
+
+RUNS = 24
+
+
+@pytest.mark.parametrize("seed", range(RUNS))
+def test_random_program_under_random_faults(muxarm, seed):
+    verdict = run(muxarm, draw(muxarm, seed))
+    assert not verdict.offences, (verdict.offences, verdict.steps)
+    assert verdict.ending in ("completed", "safe")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("first", range(1000, 1500, 50))
+def test_more_of_the_same(muxarm, first):
+    for seed in range(first, first + 50):
+        verdict = run(muxarm, draw(muxarm, seed))
+        assert not verdict.offences, (seed, verdict.offences, verdict.steps)
+
+
+def test_a_seed_plays_the_same_again(muxarm):
+    one, two = (run(muxarm, draw(muxarm, 11)) for _ in range(2))
+    assert one == two
+    assert one.steps
+
+
+def test_every_kind_of_fault_is_drawn(muxarm):
+    drawn = {f.kind for seed in range(300) for f in draw(muxarm, seed).faults}
+    assert drawn == set(FaultKind) == set(PASSING) | set(LASTING)
+
+
+# The judge
+
+
+def judged(robot, **board) -> tuple[Bench, Judge]:
+    bench = Bench(robot, axial=1, **board)
+    return bench, Judge(bench.board, 0.0)
+
+
+def beat(bench: Bench) -> None:
+    bench.step([bench.port.pack("HOST_HB", Armed=1, Session=SESSION, Watchdog=150)])
+
+
+def test_an_honest_move_offends_nobody(muxarm):
+    bench, judge = judged(muxarm)
+    bench.engage()
+    beat(bench)
+    bench.do(Op.STAGE, 1, bench.bits(0.003))
+    bench.do(Op.START, arg=1, takes=2.0)
+    bench.do(Op.RELEASE, *bench.clutch(1), takes=0.5)
+    bench.do(Op.AXIAL, arg=2, takes=3.0)
+    assert judge.offences == {}
+    assert judge.travel[0] == pytest.approx(0.003, abs=1e-6)
+    assert judge.engaged.tolist() == [1] + 8 * [0]
+
+
+def test_way_done_twice_counts_twice(muxarm):
+    bench, judge = judged(muxarm)
+    bench.engage()
+    for goal in (0.003, 0.0, 0.003):
+        bench.do(Op.STAGE, 1, bench.bits(goal))
+        bench.do(Op.START, arg=1, takes=2.0)
+    assert judge.travel[0] == pytest.approx(0.009, abs=1e-5)
+
+
+def test_motion_of_a_board_that_nobody_armed_is_seen(muxarm):
+    bench, judge = judged(muxarm)
+    bench.board.mechanics.turn({0: 1.0}, 0.5)
+    bench.step()
+    bench.now = 0.2
+    bench.step()
+    assert set(judge.offences) == {"motion although not armed", "motion inf ms after the host"}
+
+
+def test_a_drum_that_turns_with_a_clutch_in_is_seen(muxarm):
+    bench, judge = judged(muxarm)
+    bench.engage()
+    bench.board.mechanics.rotate_axial(1, 0.5)
+    bench.wait(0.1)
+    assert {k for k in judge.offences if "axial motor turned" in k} == {
+        "the axial motor turned with clutches in",
+        "the axial motor turned with coils energised",
+    }
+
+
+def test_a_clutch_that_switches_while_the_drum_turns_is_seen(muxarm):
+    bench, judge = judged(muxarm)
+    bench.arm().command(Op.AXIAL, arg=3)
+    bench.wait(0.5)
+    bench.board.energised.add(0)
+    bench.wait(0.1)
+    assert "a clutch switched while the axial motor turned" in judge.offences
+
+
+def test_a_tendon_beyond_its_range_is_seen(muxarm):
+    bench, judge = judged(muxarm)
+    bench.engage()
+    bench.board.limits = bench.board.limits * 2
+    high = float(judge._high[0])
+    bench.do(Op.STAGE, 1, bench.bits(high + 0.002))
+    bench.do(Op.START, arg=1, takes=high / float(muxarm.tendon_speed) + 2.0)
+    assert any(k.startswith("tendon 1 beyond its range") for k in judge.offences)
+
+
+def test_motion_too_long_after_the_last_heartbeat_is_seen(muxarm, monkeypatch):
+    monkeypatch.setattr("muxjax.hardware.virtual_board.WATCHDOG_S", 0.4)
+    bench, judge = judged(muxarm)
+    bench.engage()
+    bench.do(Op.STAGE, 1, bench.bits(0.03))
+    bench.port = Port("HOST")
+    bench.step([bench.port.pack("HOST_HB", Armed=1, Session=SESSION, Watchdog=255)])
+    bench.command(Op.START, arg=1)
+    bench.wait(1.0, beating=False)
+    assert any("after the host" in k for k in judge.offences)
+    assert np.isfinite(judge._heard_at)

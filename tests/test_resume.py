@@ -1,0 +1,189 @@
+"""Runs that were interrupted at any instant, and gone on with."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from test_executor import MortalLink, program, random_program, visit
+
+from muxjax.hardware import LockstepLink, MemoryJournal, execute, resume
+from muxjax.hardware.executor import Executor
+from muxjax.hardware.journal import Journal, LegEntry, ProgramEntry
+from muxjax.hardware.protocol import BoardState
+from muxjax.hardware.visits import load_visits
+from muxjax.robot import Robot
+from muxjax.scheduler import Program
+
+END_M = 2e-5
+PROBE_M = 2e-4  # there and back of one probe
+
+
+def begun(robot: Robot, made: Program) -> MemoryJournal:
+    journal = MemoryJournal()
+    goals = tuple(tuple(dict(leg) for leg in v.legs) for v in load_visits(robot, made))
+    journal.write(ProgramEntry(program=made, goals=goals))
+    return journal
+
+
+def run_until(link: LockstepLink, journal: MemoryJournal, end: float) -> None:
+    """A host that is killed at a time: its executor is gone, journal and board remain."""
+    executor = Executor(link.robot, journal, link.new_session(), link.stream_divider)
+    frames = []
+    while link.now < end and not executor.finished:
+        link.send(executor.step(link.now, frames))
+        frames = link.wait(min(end, executor.next_time))
+
+
+def travel(link: LockstepLink) -> np.ndarray:
+    """Way of each tendon since power-up [m]."""
+    _, points = link.board.mechanics.trajectory(0.0)
+    return np.abs(np.diff(points, axis=0)).sum(axis=0)
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_host_killed_at_random_instants_goes_on_to_the_same_lengths(muxarm, seed):
+    rng = np.random.default_rng(seed)
+    made, seconds = random_program(muxarm, rng, 1 + seed % 3, length=3)
+    whole = LockstepLink(muxarm, stream_divider=5)
+    assert execute(made, whole).completed
+    link, journal = LockstepLink(muxarm, stream_divider=5), begun(muxarm, made)
+    kills = 0
+    for at in np.sort(rng.uniform(0.0, seconds, 3)):
+        run_until(link, journal, float(at))
+        kills += 1
+        link.wait(link.now + float(rng.choice([0.0, 0.1, 1.0])))
+    run = resume(journal, link)
+    assert run.completed, run.reason
+    assert link.board.mechanics.displacements == pytest.approx(np.array(made.target), abs=END_M)
+    assert run.measured == pytest.approx(np.array(made.target), abs=END_M)
+    assert (travel(link) <= travel(whole) + kills * 2 * PROBE_M).all()
+    assert journal.standing.completed
+
+
+def test_resume_of_a_finished_program_moves_nothing(muxarm):
+    made, _ = random_program(muxarm, np.random.default_rng(2), 3)
+    link, journal = LockstepLink(muxarm), MemoryJournal()
+    assert execute(made, link, journal=journal).completed
+    before = travel(link)
+    run = resume(journal, link)
+    assert run.completed
+    assert run.records == ()
+    assert (travel(link) == before).all()
+
+
+def test_resume_after_a_cut_cable(muxarm):
+    made = program(muxarm, [visit(muxarm, 1, [{1: 0.02, 2: -0.01}]), visit(muxarm, 2, [{3: 0.01}])])
+    link, journal = MortalLink(muxarm), MemoryJournal()
+    link.deaf_from = link.mute_from = 6.0
+    run = execute(made, link, journal=journal)
+    assert (run.completed, run.resumable) == (False, True)
+    assert "heartbeat is lost" in run.reason
+    link.deaf_from = link.mute_from = np.inf
+    assert resume(journal, link).completed
+    assert link.board.mechanics.displacements == pytest.approx(np.array(made.target), abs=END_M)
+
+
+def test_a_short_outage_needs_nobody(muxarm):
+    class Outage(LockstepLink):
+        def send(self, frames):
+            if not 6.0 < self.now < 6.4:
+                super().send(frames)
+
+        def wait(self, until):
+            frames = super().wait(until)
+            return [] if 6.0 < self.now < 6.4 else frames
+
+    made = program(muxarm, [visit(muxarm, 1, [{1: 0.02, 2: -0.01}])])
+    link = Outage(muxarm)
+    run = execute(made, link)
+    assert run.completed, run.reason
+    assert link.board.session == 1
+    assert link.board.mechanics.displacements == pytest.approx(np.array(made.target), abs=END_M)
+
+
+def test_the_journal_is_ahead_of_the_motion(muxarm):
+    made, _ = random_program(muxarm, np.random.default_rng(4), 3, legs=3)
+    journal = MemoryJournal()
+
+    class Watch(LockstepLink):
+        def wait(self, until):
+            frames = super().wait(until)
+            moved = np.flatnonzero(np.abs(self.board.mechanics.displacements) > 2 * PROBE_M)
+            written = [e for e in journal.entries if isinstance(e, LegEntry)]
+            assert set(moved + 1) <= {c for e in written for c in e.goals}
+            return frames
+
+    assert execute(made, Watch(muxarm), journal=journal).completed
+
+
+def test_a_journal_that_cannot_be_written_stops_before_the_motion(muxarm):
+    class Full(MemoryJournal):
+        def write(self, entry, *, ahead=True):
+            if isinstance(entry, LegEntry):
+                raise OSError("No space left on device")
+            super().write(entry, ahead=ahead)
+
+    link = LockstepLink(muxarm)
+    run = execute(program(muxarm, [visit(muxarm, 1, [{1: 0.02}])]), link, journal=Full())
+    assert (run.completed, run.resumable) == (False, True)
+    assert run.reason == "instruction 1: journal: No space left on device"
+    assert np.abs(link.board.mechanics.displacements).max() < PROBE_M
+    assert link.board.state is BoardState.READY
+
+
+def test_an_arm_that_was_moved_by_hand_is_refused(muxarm):
+    made = program(muxarm, [visit(muxarm, 1, [{1: 0.02}]), visit(muxarm, 2, [{1: 0.02}])])
+    link, journal = LockstepLink(muxarm), begun(muxarm, made)
+    run_until(link, journal, 14.0)
+    link.wait(15.0)
+    link.board.mechanics.displacements[8] += 0.003
+    link.board.mechanics.wheels[8] += 0.003
+    with pytest.raises(ValueError, match=r"lengths: tendon 9 stands 3.* from where the journal"):
+        resume(journal, link)
+
+
+def test_an_unfinished_journal_takes_no_other_program(muxarm):
+    made = program(muxarm, [visit(muxarm, 1, [{1: 0.02}])])
+    journal = begun(muxarm, made)
+    with pytest.raises(ValueError, match="journal: holds a program that is not finished"):
+        execute(made, LockstepLink(muxarm), journal=journal)
+    with pytest.raises(ValueError, match="journal: holds no program"):
+        resume(MemoryJournal(), LockstepLink(muxarm))
+
+
+def test_a_host_that_died_a_moment_ago_is_waited_for(muxarm):
+    made = program(muxarm, [visit(muxarm, 1, [{1: 0.02}])])
+    link, journal = LockstepLink(muxarm), begun(muxarm, made)
+    run_until(link, journal, 6.0)
+    assert link.board.state is BoardState.ARMED
+    assert resume(journal, link).completed
+
+
+def test_a_host_that_lives_keeps_its_board(muxarm):
+    made = program(muxarm, [visit(muxarm, 1, [{1: 0.02}])])
+    link, journal = LockstepLink(muxarm), begun(muxarm, made)
+    run_until(link, journal, 6.0)
+
+    class Shared(LockstepLink):
+        def __init__(self):
+            self.__dict__.update(link.__dict__)
+
+        def wait(self, until):
+            self.board._host_heard = self.board.mechanics.time
+            return super().wait(until)
+
+    run = execute(made, Shared())
+    assert run.reason == "HELLO: the board is armed by another host that lives"
+    assert link.board.state is BoardState.ARMED
+
+
+def test_a_file_serves_as_journal(muxarm, tmp_path):
+    made = program(muxarm, [visit(muxarm, 1, [{1: 0.02}]), visit(muxarm, 2, [{2: 0.01}])])
+    link = LockstepLink(muxarm)
+    with Journal.open(tmp_path / "j") as journal:
+        for entry in begun(muxarm, made).entries:
+            journal.write(entry)
+        run_until(link, journal, 8.0)
+    with Journal.open(tmp_path / "j") as journal:
+        assert resume(journal, link).completed
+    assert link.board.mechanics.displacements == pytest.approx(np.array(made.target), abs=END_M)

@@ -12,6 +12,7 @@ from muxjax.hardware import BusLink, Link, LockstepLink, load_physics
 from muxjax.hardware.conformance import Finding, run_checks
 from muxjax.hardware.firmware import write_firmware
 from muxjax.hardware.links import open_bus
+from muxjax.hardware.mapping import MappedLink, Translation
 from muxjax.robot import Robot, load_robot
 
 
@@ -41,6 +42,7 @@ def conformance(
     allow_motion: bool = False,
     just_powered: bool = False,
     only: tuple[str, ...] | None = None,
+    mapping: Path | None = None,
     json: bool = False,
 ) -> int:
     """Check that a board keeps the protocol's promises; exit code 1 where it breaks one.
@@ -56,11 +58,12 @@ def conformance(
         allow_motion: Make the checks that move the arm, too; let it hang free.
         just_powered: Nobody has spoken to the board since its power-up.
         only: Names of the checks to make; all by default.
+        mapping: YAML file of a lab's own DBC that the board on --bus speaks.
         json: Print the findings as JSON.
     """
     arm = load_robot(robot)
     on_finding = None if json else _print_finding
-    with _open(bus, arm) as link:
+    with _open(bus, arm, mapping) as link:
         findings = run_checks(
             link,
             allow_motion=allow_motion,
@@ -84,10 +87,11 @@ def _print_finding(finding: Finding) -> None:
 
 
 @contextlib.contextmanager
-def _open(bus: str | None, arm: Robot) -> Iterator[Link]:
+def _open(bus: str | None, arm: Robot, mapping: Path | None) -> Iterator[Link]:
     """The link that --bus asks for."""
     if bus is None:
         yield LockstepLink(arm)
         return
     with open_bus(bus) as opened:
-        yield BusLink(opened, arm)
+        link = BusLink(opened, arm)
+        yield link if mapping is None else MappedLink(link, Translation(mapping))

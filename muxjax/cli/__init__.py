@@ -1,4 +1,4 @@
-"""The command line: ``muxjax bench | board | conformance | demo | firmware | fk | ik | plan | ...``.
+"""The command line: ``muxjax bench | board | conformance | demo | firmware | fk | ik | ...``.
 
 A person types and reads millimetres and degrees; ``--json`` prints SI units for a machine. The exit
 code is 0 on success, 1 where a pose was not reached or a run did not complete, 2 on bad input.

@@ -132,7 +132,7 @@ class _Entry:
             return Frame(ESTOP_ID, b"") if is_estop else None
         if self.config.crc and not is_estop and data[0] != frame_crc(self.theirs.frame_id, data):
             return None
-        theirs = self.theirs.decode(data, decode_choices=False)
+        theirs = self.theirs.decode_simple(data, decode_choices=False)
         values = dict(self.config.constant)
         for name, mapped in self.signals.items():
             value = (float(theirs[mapped.signal]) - mapped.offset) / mapped.scale  # type: ignore[arg-type]
@@ -217,7 +217,7 @@ class MappedLink:
         self._link.send(self._translation.out(frames))
 
     def wait(self, until: float) -> list[Frame]:
-        """Frames as soon as some arrive, translated; none by ``until`` [s], or if all are foreign."""
+        """Translated frames as soon as some arrive; none by ``until`` [s] or of foreign ones."""
         return self._translation.back(self._link.wait(until))
 
     def trajectory(self, since: float) -> Trajectory | None:

@@ -10,9 +10,9 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
@@ -50,7 +50,8 @@ ANSWER_S = 0.2  # a board that has not answered by then does not answer
 JOB_S = 1.0  # clutches and their probe
 BRAKE_S = 0.05  # beyond the watchdog, until nothing moves (HARDWARE.md, host loss)
 WAY_M = 0.004  # how far the checks move a tendon from where it stands
-STILL_COUNTS = 2  # an encoder's noise
+STILL_COUNTS = 4  # an encoder's noise
+SWITCH_M = 1e-3  # what a wheel may do when its clutch goes in and out again: 0.5 mm each (M VI-B)
 FRAME_BITS = 135  # of a frame with worst-case stuffing
 BIT_RATE = 1e6
 MAX_LOAD = 0.15
@@ -144,7 +145,12 @@ class Bench:
         self.ears = Port("HOST")
         self.sensors = Sensors(self.robot)
         self.heard: list[tuple[float, Received]] = []
+        self.acks: list[Mapping[str, Any]] = []
+        self.emergencies: list[tuple[float, Mapping[str, Any]]] = []
+        self.beats = 0  # BOARD_HB heard
         self.refused: Counter[Refusal] = Counter()
+        self.faults = Fault(0)  # of the last BOARD_HB
+        self.refused_by_board: int | None = None  # of the last POWER_FB
         self.beating = False
         self._beat_due = -math.inf
 
@@ -169,7 +175,19 @@ class Bench:
                 self.refused[received] += 1
             else:
                 self.heard.append((self.link.now, received))
+                self._sort(received)
                 self.sensors.update(self.link.now, received.name, received.values)
+
+    def _sort(self, received: Received) -> None:
+        if received.name == "ACK":
+            self.acks.append(received.values)
+        elif received.name == "EMCY":
+            self.emergencies.append((self.link.now, received.values))
+        elif received.name == "BOARD_HB":
+            self.beats += 1
+            self.faults = Fault(received.values["Faults"])
+        elif received.name == "POWER_FB":
+            self.refused_by_board = received.values["Refused"]
 
     def send(self, *frames: Frame) -> None:
         """Put frames on the bus."""
@@ -185,6 +203,8 @@ class Bench:
         self._hear(self.link.wait(self.link.now))
         self.heard.clear()
         self.refused.clear()
+        self.acks.clear()
+        self.emergencies.clear()
 
     # Commands
 
@@ -194,20 +214,19 @@ class Bench:
         """Status, reason and detail of the first answer to a command."""
         if seq is None:
             self.seq = seq = (self.seq + 1) & 0xFFFF
-        mark = len(self.heard)
+        mark = len(self.acks)
         self.send(self.port.pack("CMD", Seq=seq, Op=op, Idx=idx, Arg=arg))
         self.wait(ANSWER_S, lambda: any(self._acks(seq, mark)))
         for values in self._acks(seq, mark):
             return Status(values["Status"]), Reason(values["Reason"]), values["Detail"]
         raise Broken(f"no answer to {_name(op)} within {ANSWER_S:g} s")
 
-    def _acks(self, seq: int, since: int) -> Iterator[dict]:
-        heard = (received for _, received in self.heard[since:])
-        return (dict(h.values) for h in heard if h.name == "ACK" and h.values["Seq"] == seq)
+    def _acks(self, seq: int, since: int) -> Iterator[Mapping[str, Any]]:
+        return (ack for ack in self.acks[since:] if ack["Seq"] == seq)
 
     def do(self, op: int, idx: int = 0, arg: int = 0, within: float = 0.0) -> None:
         """A command that must succeed, its job included."""
-        mark = len(self.heard)
+        mark = len(self.acks)
         status, reason, _ = self.ask(op, idx, arg)
         seq = self.seq
         if status is Status.ACCEPTED:
@@ -218,7 +237,8 @@ class Bench:
             last = list(self._acks(seq, mark))[-1]
             status, reason = Status(last["Status"]), Reason(last["Reason"])
         if status is not Status.DONE:
-            raise Broken(f"{_name(op)} {idx} {arg}: expected DONE, got {_say(status, reason)}")
+            found = _say(status, reason) + self._stopped()
+            raise Broken(f"{_name(op)} {idx} {arg}: expected DONE, got {found}")
 
     def refuses(
         self, op: int, idx: int, arg: int, reason: Reason, status: Status = Status.REJECTED
@@ -228,10 +248,15 @@ class Bench:
         if (found_status, found) != (status, reason):
             raise Broken(
                 f"{_name(op)} {idx} {arg}: expected {_say(status, reason)}, "
-                f"got {_say(found_status, found)}"
+                f"got {_say(found_status, found)}{self._stopped()}"
             )
         if status is Status.BUSY:
             self.seq = (self.seq - 1) & 0xFFFF  # the number is not used up
+
+    def _stopped(self) -> str:
+        if not self.emergencies:
+            return ""
+        return f"; the board had stopped: {Reason(self.emergencies[-1][1]['Code']).name}"
 
     # Ways to a state
 
@@ -296,23 +321,9 @@ class Bench:
     @property
     def state(self) -> BoardState | None:
         """Of the last BOARD_HB in this session; heard anew, for one may be under way."""
-        mark = len(self.heard)
-        self.wait(
-            2 * BOARD_BEAT_S + 0.02, lambda: any(h.name == "BOARD_HB" for _, h in self.heard[mark:])
-        )
+        beats = self.beats
+        self.wait(2 * BOARD_BEAT_S + 0.02, lambda: self.beats > beats)
         return self.sensors.state
-
-    @property
-    def faults(self) -> Fault:
-        """Of the last BOARD_HB."""
-        last = next((h for _, h in reversed(self.heard) if h.name == "BOARD_HB"), None)
-        return Fault(0) if last is None else Fault(last.values["Faults"])
-
-    @property
-    def refused_by_board(self) -> int | None:
-        """Of the last POWER_FB."""
-        last = next((h for _, h in reversed(self.heard) if h.name == "POWER_FB"), None)
-        return None if last is None else last.values["Refused"]
 
     def counts(self) -> np.ndarray:
         """Wheels, whole turns included, heard anew."""
@@ -481,10 +492,10 @@ def broken_frames_are_refused(bench: Bench) -> None:
     short = Frame(good.id, bytes([frame_crc(good.id, good.data[:7])]) + good.data[1:7])
     bench.wait(1.0, lambda: bench.refused_by_board is not None)
     before = bench.refused_by_board or 0
-    bench.heard.clear()
+    bench.acks.clear()
     bench.send(broken, short, Frame(0x7F0, good.data))
     bench.wait(ANSWER_S)
-    bench.expect(not _acks_heard(bench), "a broken frame was answered")
+    bench.expect(not bench.acks, "a broken frame was answered")
     bench.expect(bool(bench.faults & Fault.FRAMES_REFUSED), "no fault bit for refused frames")
     counted = (bench.refused_by_board or 0) - before
     bench.expect(counted == 3, f"POWER_FB counts {counted} refused frames of 3")
@@ -492,12 +503,8 @@ def broken_frames_are_refused(bench: Bench) -> None:
     bench.wait(ANSWER_S)
     bench.send(good)
     bench.wait(ANSWER_S)
-    bench.expect(_acks_heard(bench) == 1, f"a repeated counter: {_acks_heard(bench)} answers")
+    bench.expect(len(bench.acks) == 1, f"a repeated counter: {len(bench.acks)} answers")
     bench.seq = (bench.seq + 1) & 0xFFFF
-
-
-def _acks_heard(bench: Bench) -> int:
-    return sum(h.name == "ACK" for _, h in bench.heard)
 
 
 def watchdog_expires(bench: Bench) -> None:
@@ -529,17 +536,16 @@ def stranger_does_not_keep_the_board_armed(bench: Bench) -> None:
 
 
 def _lose_host(bench: Bench, watchdog_s: float, asked_ms: int) -> None:
+    bench.emergencies.clear()
     bench.beat(watchdog_ms=asked_ms)
-    last, mark = bench.link.now, len(bench.heard)
-
-    def told() -> bool:
-        return any(h.name == "EMCY" for _, h in bench.heard[mark:])
-
-    bench.wait(watchdog_s + BRAKE_S, told)
-    bench.expect(told(), f"no EMCY within {1e3 * (watchdog_s + BRAKE_S):g} ms of host loss")
-    after = next(at for at, h in bench.heard[mark:] if h.name == "EMCY") - last
-    code = next(h.values["Code"] for _, h in bench.heard[mark:] if h.name == "EMCY")
-    bench.expect(code == Reason.WATCHDOG, f"EMCY says {Reason(code).name}, not WATCHDOG")
+    last = bench.link.now
+    bench.wait(watchdog_s + BRAKE_S, lambda: bool(bench.emergencies))
+    told = bool(bench.emergencies)
+    bench.expect(told, f"no EMCY within {1e3 * (watchdog_s + BRAKE_S):g} ms of host loss")
+    after, values = bench.emergencies[0]
+    after -= last
+    code = Reason(values["Code"])
+    bench.expect(code is Reason.WATCHDOG, f"EMCY says {code.name}, not WATCHDOG")
     bench.expect(
         after > watchdog_s - 0.005, f"stopped {1e3 * after:.0f} ms after the last heartbeat"
     )
@@ -646,7 +652,8 @@ def clutch_interlocks(bench: Bench) -> None:
     bench.refuses(Op.AXIAL, 0, 2, Reason.CLUTCH_IN)
     bench.expect(bench.wait(JOB_S, lambda: bench.sensors.clutches_out), "a clutch stays in")
     bench.wait(JOB_S)
-    bench.stays(before, "after engaging and releasing")
+    moved = np.abs(bench.counts() - before).max() * bench.sensors.metres_per_count
+    bench.expect(moved <= SWITCH_M, f"engaging and releasing moved a wheel by {1e3 * moved:.2f} mm")
     bench.go_to(2)
 
 
@@ -815,11 +822,7 @@ def _start_long_move(bench: Bench, tendon: int) -> tuple[Status, Reason]:
 
 def _stays_stopped(bench: Bench, what: str, reason: Reason) -> None:
     stopped = bench.counts()
-    aborted = [
-        h.values["Reason"]
-        for _, h in bench.heard
-        if h.name == "ACK" and h.values["Status"] == Status.ABORTED
-    ]
+    aborted = [ack["Reason"] for ack in bench.acks if ack["Status"] == Status.ABORTED]
     bench.expect(aborted[-1:] == [reason], f"{what}: START was not ABORTED {reason.name}")
     bench.wait(1.0)
     bench.stays(stopped, f"after {what}")
@@ -840,12 +843,11 @@ def estop_stops_and_is_latched(bench: Bench) -> None:
 
 
 def _estop(bench: Bench) -> None:
-    mark = len(bench.heard)
+    beats = bench.beats
     bench.send(Frame(ESTOP_ID, b"\x00" * 8))
 
     def confirmed() -> bool:
-        beats = [h for _, h in bench.heard[mark:] if h.name == "BOARD_HB"]
-        return bool(beats) and beats[-1].values["State"] == BoardState.ESTOPPED
+        return bench.beats > beats and bench.sensors.state is BoardState.ESTOPPED
 
     bench.expect(bench.wait(ANSWER_S, confirmed), "ESTOP with a broken CRC was not taken")
     bench.expect(bool(bench.faults & Fault.ESTOP), "no fault bit for the ESTOP")

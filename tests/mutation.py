@@ -208,7 +208,7 @@ def lost_turns(bench: Bench) -> None:
     # A board fresh from reset knows the last number as 0.
     answer = bench.ask(Op.TURNS, 0, 1 << 16, seq=1)
     bench.expect(answer[1] is Reason.WRONG_SESSION, "TURNS was taken before HELLO")
-    bench.greet()
+    bench.do(Op.HELLO, arg=VERSION << 16 | bench.session)
     bench.wait(0.1)
     bench.expect(bool(bench.faults & Fault.TURNS_LOST), "no fault bit for lost turns")
     bench.check_robot()

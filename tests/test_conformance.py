@@ -3,13 +3,18 @@
 from __future__ import annotations
 
 import json
+import signal
+import subprocess
+import sys
 
+import numpy as np
 import pytest
 from c_board import SHIM, CBoard, build
 
 from muxjax.cli import main
-from muxjax.hardware import LockstepLink
+from muxjax.hardware import BusLink, LockstepLink
 from muxjax.hardware.conformance import CHECKS, MOVING, run_checks
+from muxjax.hardware.links import open_bus
 from muxjax.hardware.protocol import Frame, Port, Received
 
 
@@ -88,3 +93,31 @@ def test_frames_of_the_suite_are_the_protocol_s(muxarm):
     link.send = lambda frames: (sent.extend(ears.unpack(f) for f in frames), send(frames))
     run_checks(link, only=["handshake_in_order", "nonsense_is_refused"])
     assert all(isinstance(s, Received) for s in sent)
+
+
+def test_a_board_that_lost_its_turns_is_told_them_if_the_arm_is_straight(muxarm):
+    start = np.array([1, -1, 0, 0, 0, 0, 0, 0, 0]) * 1e-3
+    for straight, verdict in ((False, "skipped"), (True, "pass")):
+        link = LockstepLink(muxarm, displacements=start)
+        link.board.power_cycle(off_s=0.0)
+        link.wait(1.0)
+        found = run_checks(link, allow_motion=True, straight=straight, only=["clutch_interlocks",
+                           "tendon_range_is_kept"])  # fmt: skip
+        assert {f.verdict for f in found} == {verdict}
+    assert link.board.senses.displacements() == pytest.approx(start, abs=1e-5)
+
+
+@pytest.mark.slow
+def test_over_a_bus_and_another_process(muxarm):
+    """What does not hang on the times of a loaded machine."""
+    command = [sys.executable, "-c", "from muxjax.cli import main; main()", "board", "--port", "0"]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as board:
+        line = board.stdout.readline()
+        bus = open_bus(line[line.index("{") :].strip())
+        with bus:
+            found = run_checks(BusLink(bus, muxarm), just_powered=True, only=["powers_up_silent",
+                               "handshake_in_order", "nonsense_is_refused", "sequence_window",
+                               "broken_frames_are_refused"])  # fmt: skip
+        board.send_signal(signal.SIGINT)
+        board.wait(20)
+    assert [(f.name, f.verdict, f.reason) for f in found] == [(f.name, "pass", "") for f in found]

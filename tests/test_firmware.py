@@ -11,6 +11,7 @@ import pytest
 from c_board import SHIM, CBoard, build
 
 import muxjax
+from muxjax.cli import main
 from muxjax.hardware import LockstepLink, VirtualBoard, execute, load_physics
 from muxjax.hardware.codec import database, layouts
 from muxjax.hardware.firmware import HAND_WRITTEN, values_header, write_firmware
@@ -375,3 +376,12 @@ def test_a_robot_of_another_shape_compiles_and_runs(tmp_path):
     for _ in script(twins, rng, 60):
         twins.agree()
     assert twins.c.dropped == 0
+
+
+def test_command_writes_the_files(tmp_path, capsys):
+    with pytest.raises(SystemExit) as stop:
+        main(["firmware", "--out", str(tmp_path / "out"), "--robot", "penta"])
+    assert stop.value.code == 0
+    assert "8 files in" in capsys.readouterr().out
+    written = (tmp_path / "out" / "board_config.c").read_text()
+    assert f"hash {muxjax.load_robot('penta').fingerprint}" in written

@@ -41,6 +41,7 @@ def conformance(
     robot: str = "muxarm",
     allow_motion: bool = False,
     just_powered: bool = False,
+    straight: bool = False,
     only: tuple[str, ...] | None = None,
     mapping: Path | None = None,
     json: bool = False,
@@ -57,6 +58,7 @@ def conformance(
         robot: Shipped robot or path of a YAML file.
         allow_motion: Make the checks that move the arm, too; let it hang free.
         just_powered: Nobody has spoken to the board since its power-up.
+        straight: The arm stands straight, should the board have lost its wheels' turns.
         only: Names of the checks to make; all by default.
         mapping: YAML file of a lab's own DBC that the board on --bus speaks.
         json: Print the findings as JSON.
@@ -68,6 +70,7 @@ def conformance(
             link,
             allow_motion=allow_motion,
             just_powered=just_powered,
+            straight=straight,
             only=only,
             on_finding=on_finding,
         )

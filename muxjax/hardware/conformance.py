@@ -20,6 +20,7 @@ from muxjax.hardware.codec import database
 from muxjax.hardware.links import Link
 from muxjax.hardware.protocol import (
     BOARD_BEAT_S,
+    COUNTS_PER_TURN,
     ESTOP_ID,
     HOST_BEAT_S,
     MAX_DIVIDER,
@@ -86,6 +87,7 @@ def run_checks(
     *,
     allow_motion: bool = False,
     just_powered: bool = False,
+    straight: bool = False,
     only: Iterable[str] | None = None,
     on_finding: Callable[[Finding], None] | None = None,
 ) -> tuple[Finding, ...]:
@@ -95,6 +97,8 @@ def run_checks(
         link: A way to the board.
         allow_motion: The arm may move; without it, checks that move it are skipped.
         just_powered: Nobody has spoken to the board since its power-up.
+        straight: The arm stands straight: a board that has lost its wheels' whole turns is told
+            those next to displacement 0.
         only: Names of the checks to make; all if None.
         on_finding: Called after each check.
 
@@ -104,7 +108,7 @@ def run_checks(
     wanted = set(CHECKS if only is None else only)
     if unknown := sorted(wanted - CHECKS.keys()):
         raise ValueError(f"only: no check {unknown[0]!r}; there are {', '.join(CHECKS)}")
-    bench = Bench(link, allow_motion, just_powered)
+    bench = Bench(link, allow_motion, just_powered, straight)
     findings = []
     for name in (name for name in CHECKS if name in wanted):
         finding = _make(bench, name)
@@ -132,13 +136,27 @@ def _make(bench: Bench, name: str) -> Finding:
 
 
 class Bench:
-    """A host at the bench: sends what a check tells it, keeps what it hears."""
+    """A host at the bench: sends what a check, or a person, tells it, keeps what it hears.
 
-    def __init__(self, link: Link, allow_motion: bool, just_powered: bool) -> None:
+    Args:
+        link: A way to the board.
+        allow_motion: As for ``run_checks``.
+        just_powered: Likewise.
+        straight: Likewise.
+    """
+
+    def __init__(
+        self,
+        link: Link,
+        allow_motion: bool = False,
+        just_powered: bool = False,
+        straight: bool = False,
+    ) -> None:
         self.link = link
         self.allow_motion = allow_motion
         self.robot: Robot = link.robot
         self.just_powered = just_powered
+        self.straight = straight
         self.session = link.new_session()
         self.seq = (self.session * 257) & 0xFFFF
         self.port = Port("HOST")
@@ -261,8 +279,21 @@ class Bench:
     # Ways to a state
 
     def greet(self) -> None:
-        """To READY."""
+        """To READY, every wheel's turns known."""
         self.do(Op.HELLO, arg=VERSION << 16 | self.session)
+        beats = self.beats
+        self.wait(2 * BOARD_BEAT_S + 0.02, lambda: self.beats > beats)
+        if Fault.TURNS_LOST in self.faults:
+            self._tell_turns()
+
+    def _tell_turns(self) -> None:
+        if not self.straight:
+            raise Skipped("the board has lost its wheels' turns; straighten the arm and say so")
+        counts = self.counts().astype(int)
+        for wheel, angle in enumerate(counts % COUNTS_PER_TURN, start=1):
+            turn = -1 if angle >= COUNTS_PER_TURN // 2 else 0
+            self.do(Op.TURNS, arg=wheel << 16 | turn & 0xFFFF)
+        self.sensors.forget_turns()
 
     def check_robot(self) -> None:
         """Send the four words of the robot's hash."""
@@ -328,6 +359,7 @@ class Bench:
     def counts(self) -> np.ndarray:
         """Wheels, whole turns included, heard anew."""
         self.listen()
+        self.wait(1.0, lambda: self.sensors.complete)
         return np.rint(self.sensors.displacements() / self.sensors.metres_per_count)
 
     def servo_bits(self, servo: int) -> int:

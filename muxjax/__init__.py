@@ -2,7 +2,7 @@
 
 from muxjax.collision import World, clearance, load_world
 from muxjax.config import ConfigError
-from muxjax.hardware import LockstepLink, Run, execute
+from muxjax.hardware import BusLink, Journal, LockstepLink, Run, execute, resume
 from muxjax.ik import (
     AllIkResult,
     IkError,
@@ -36,6 +36,7 @@ from muxjax.workspace import load_sweep, sweep
 
 __all__ = [
     "AllIkResult",
+    "BusLink",
     "ConfigError",
     "ElasticChain",
     "Equilibrium",
@@ -44,6 +45,7 @@ __all__ = [
     "IkStatus",
     "Instruction",
     "InverseResult",
+    "Journal",
     "LockstepLink",
     "Metrics",
     "PathResult",
@@ -74,6 +76,7 @@ __all__ = [
     "load_sweep",
     "load_world",
     "plan",
+    "resume",
     "schedule",
     "solve_ik",
     "solve_path",

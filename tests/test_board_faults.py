@@ -145,6 +145,28 @@ def test_a_reset_stops_within_the_horizon_and_loses_the_turns(muxarm, kind):
     assert bench.board.slot == -1
 
 
+@pytest.mark.parametrize(
+    ("kind", "reason"),
+    [("undervoltage", Reason.UNDERVOLTAGE), ("coil_heat", Reason.COIL_HOT)],
+)
+def test_a_board_that_would_stop_at_once_is_not_armed(muxarm, kind, reason):
+    bench = Bench(muxarm, faults=[fault(kind, at_s=0.0, for_s=3.0)])
+    bench.do(Op.HELLO, arg=VERSION << 16 | SESSION)
+    for k, word in enumerate(fingerprint_words(muxarm.fingerprint), start=1):
+        bench.do(Op.ROBOT, k, word)
+    bench.wait(2.5)
+    assert bench.command(Op.ARM, arg=SESSION) == (Status.REJECTED, reason)
+    bench.wait(400.0 if kind == "coil_heat" else 1.0)
+    bench.do(Op.ARM, arg=SESSION)
+
+
+def test_turns_are_not_told_to_an_armed_or_stopped_board(muxarm):
+    bench = Bench(muxarm).arm()
+    assert bench.command(Op.TURNS, arg=1 << 16) == (Status.REJECTED, Reason.ARMED_ALREADY)
+    bench.step([Frame(0x008, b"")])
+    assert bench.command(Op.TURNS, arg=1 << 16) == (Status.REJECTED, Reason.ESTOPPED)
+
+
 def test_turns_are_told_only_where_they_were_lost_and_within_the_range(muxarm):
     bench = Bench(muxarm)
     bench.seq = 0
@@ -235,6 +257,8 @@ def test_a_switch_changes_a_tendon_with_or_without_its_wheel(muxarm, seen):
     assert 0.4e-3 - 1e-9 <= abs(bench.truth[0]) <= 0.6e-3 + 1e-9
     assert bool(abs(mechanics.wheels[0]) > 0.3e-3) is seen
     assert not bench.truth[1:].any()
+    times, points = mechanics.trajectory(0.0)
+    assert not points[times < times[np.argmax(points[:, 0] != 0)], 0].any()  # a jump, no slope
     sensed = bench.board.senses.displacements()
     assert sensed == pytest.approx(mechanics.wheels, abs=COUNT_M)
 

@@ -5,10 +5,13 @@ The long one: ``python -m tests.campaigns --runs 10000 --seed 0 --workers 2``.
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import pytest
 from test_virtual_board import SESSION, Bench
 
+from muxjax.hardware import VirtualBoard
 from muxjax.hardware.faults import FaultKind
 from muxjax.hardware.protocol import Op, Port
 from tests.campaigns.campaign import run
@@ -42,6 +45,13 @@ def test_a_seed_plays_the_same_again(muxarm):
 def test_every_kind_of_fault_is_drawn(muxarm):
     drawn = {f.kind for seed in range(300) for f in draw(muxarm, seed).faults}
     assert drawn == set(FaultKind) == set(PASSING) | set(LASTING)
+
+
+def test_a_board_without_its_watchdog_is_found(muxarm, monkeypatch):
+    monkeypatch.setattr(VirtualBoard, "_watchdog_end", math.inf)
+    killed = [seed for seed in range(40) if draw(muxarm, seed).kills][:8]
+    offences = [o for seed in killed for o in run(muxarm, draw(muxarm, seed)).offences]
+    assert any("after the host" in o for o in offences)
 
 
 # The judge

@@ -13,6 +13,7 @@ from PIL import Image
 
 from muxjax.cli import main
 from muxjax.cli.plans import Method
+from muxjax.hardware import Journal
 from muxjax.planning import METHODS
 from muxjax.workspace import load_sweep
 
@@ -223,6 +224,36 @@ def test_plan_then_run(muxjax, tmp_path):
     assert "completed" in out
 
 
+def test_a_dry_run_opens_no_bus_and_leaves_journal_and_log(muxjax, tmp_path):
+    path, journal, log = (str(tmp_path / name) for name in ("program.json", "j", "log"))
+    muxjax("plan", "--q-deg", "10", "0", "5", "90", "3", "180", "--out", path)
+    options = ("--dry-run", "--physics", "realistic", "--journal", journal, "--log", log)
+    code, out, err = muxjax("run", path, "--bus", "{}", *options, "--json")
+    assert code == 0
+    document = json.loads(out)
+    assert document["completed"] is True
+    assert all(check["passed"] for check in document["preflight"])
+    assert "robot" in err
+    assert "instruction 1 of" in err
+    with open(log) as frames:
+        assert frames.readline().startswith("(0.000000) can0 020#")
+    with Journal.open(journal) as kept:
+        assert kept.standing.completed
+
+
+def test_a_bus_that_cannot_be_opened_comes_after_the_rehearsal(muxjax, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    path = str(tmp_path / "program.json")
+    muxjax("plan", "--q-deg", "10", "0", "5", "90", "3", "180", "--out", path)
+    code, out, err = muxjax("run", path, "--bus", '{"interface": "none such"}')
+    assert code == 2
+    assert "rehearsed on the virtual board" in out
+    assert "cannot be opened" in err
+    assert len(err.strip().splitlines()) == 1
+    code, out, _ = muxjax("run", path, "--bus", '{"interface": "none such"}', "--no-rehearse")
+    assert (code, out) == (2, "")
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
@@ -238,6 +269,8 @@ def test_plan_then_run(muxjax, tmp_path):
         (["plan", "--q-deg", "1", "1", "1", "1", "1", "1", "--preset", "x"], "no 'x' among"),
         (["plan", "--q-deg", "1", "1", "1", "1", "1", "1", "--max-step-mm", "inf"], "max_step"),
         (["run", "nothing.json"], "nothing.json: cannot be read"),
+        (["resume", "nothing.journal", "--bus", "{}"], "nothing.journal: no such journal"),
+        (["board", "--physics", "nothing"], "no 'nothing' among the shipped files"),
         (["demo", "--task", "nothing"], "no 'nothing' among the shipped files"),
     ],
 )
@@ -327,5 +360,5 @@ def test_the_installed_command_starts():
         text=True,
         check=True,
     )
-    for command in ("demo", "fk", "ik", "plan", "run", "sweep"):
+    for command in ("board", "demo", "fk", "ik", "plan", "resume", "run", "sweep"):
         assert command in done.stdout

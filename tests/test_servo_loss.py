@@ -7,8 +7,9 @@ import dataclasses
 import numpy as np
 import pytest
 from test_executor import program, random_program, visit
+from test_resume import pass_time
 
-from muxjax.hardware import LockstepLink, MemoryJournal, execute, resume
+from muxjax.hardware import LockstepLink, MemoryJournal, execute, load_physics, resume
 from muxjax.hardware.faults import FaultConfig
 from muxjax.hardware.protocol import BoardState
 from muxjax.pipeline import run_to_target
@@ -37,6 +38,28 @@ def test_a_servo_that_dies_is_named_and_done_without(muxarm, kind):
     assert done.completed, done.reason
     assert journal.standing.program.servos == (1, 3)
     assert link.board.mechanics.displacements == pytest.approx(np.array(made.target), abs=END_M)
+
+
+def test_a_servo_that_is_dead_before_is_seen_in_the_preflight(muxarm):
+    made = program(
+        muxarm, [visit(muxarm, 1, [{1: 0.004, 2: -0.002}]), visit(muxarm, 2, [{2: 0.001}])]
+    )
+    link = LockstepLink(muxarm, faults=[fault("servo_offline", index=1, at_s=0.0)])
+    run = execute(made, link)
+    assert (run.completed, run.failed_servos) == (False, (1,))
+    assert run.reason == "servos: [1] stalled or offline"
+    assert [c.name for c in run.checks if not c.passed] == ["servos"]
+    assert link.board.state is BoardState.READY
+    assert run_to_target(link, MemoryJournal(), made).completed
+    unused = program(muxarm, [visit(muxarm, 3, [{3: 0.001}])], np.array(made.target))
+    assert execute(unused, link).completed
+
+
+def test_a_low_supply_is_seen_in_the_preflight(muxarm):
+    low = load_physics("ideal").model_copy(update={"supply_v": 15.0})
+    run = execute(program(muxarm, [visit(muxarm, 1, [{1: 0.004}])]), LockstepLink(muxarm, low))
+    assert (run.completed, run.resumable) == (False, True)
+    assert run.reason == "supply: 15.0 V, at least 18 V"
 
 
 def test_two_servos_die_one_after_the_other(muxarm):
@@ -114,7 +137,7 @@ def test_bus_off_is_resumed_after_a_power_cycle(muxarm):
     assert (run.completed, run.resumable) == (False, True)
     assert "heartbeat is lost" in run.reason
     link.board.power_cycle()
-    link.wait(link.now + 2.0)
+    pass_time(link, 2.0)
     assert resume(journal, link).completed
     assert link.board.mechanics.displacements == pytest.approx(np.array(made.target), abs=END_M)
 

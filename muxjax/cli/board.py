@@ -54,7 +54,7 @@ def board(
     if serve == "socketcand":
         wire = SocketcandWire(port)
         bus: dict[str, Any] = {"interface": "socketcand", "host": LOOPBACK, "port": wire.port}
-        bus["channel"] = "can0"
+        bus |= {"channel": "can0", "tcp_tune": True}
     else:
         wire = SlcanWire()
         bus = {"interface": "slcan", "channel": wire.path, "sleep_after_open": 0}

@@ -185,8 +185,8 @@ def on_bus(
         begin_s = time.time() - link.now
         ours = link if mapping is None else MappedLink(link, Translation(mapping))
         done = go_logged(ours, log, begin_s, lambda logged: go(logged, tell))
-    for text, count in link.errors.items():
-        console.print(f"bus: {text}, {count} times")
+    for kind, count in link.errors.items():
+        console.print(f"bus: raised {kind} {count} times")
     return done
 
 

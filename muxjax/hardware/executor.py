@@ -124,12 +124,20 @@ def execute(
             "journal: holds a program that is not finished; go on with it by resume, or begin "
             "another journal"
         )
-    check_robot_fits(link.robot)
-    goals = tuple(
-        tuple(dict(leg) for leg in visit.legs) for visit in load_visits(link.robot, program)
-    )
-    journal.write(ProgramEntry(program=program, goals=goals))
+    begin(link.robot, program, journal)
     return _drive(link, journal, on_progress)
+
+
+def begin(robot: Robot, program: Program, journal: MemoryJournal) -> None:
+    """Check a program, pin its absolute goals and write both into a journal.
+
+    Raises:
+        ValueError: The protocol cannot carry the robot, or the program is wrong for it.
+    """
+    check_robot_fits(robot)
+    visits = load_visits(robot, program)
+    goals = tuple(tuple(dict(leg) for leg in visit.legs) for visit in visits)
+    journal.write(ProgramEntry(program=program, goals=goals))
 
 
 def resume(journal: MemoryJournal, link: Link, *, on_progress: OnProgress | None = None) -> Run:
@@ -317,6 +325,7 @@ class Executor(Transaction):
                 self._completed, self._reason = True, "completed"
                 break
             except Failed as caught:
+                self._guarded = False  # the stop that this one announces is no second failure
                 failure = yield from self._explain(caught)
                 failures.append(str(failure))
                 failures += yield from self._leave()

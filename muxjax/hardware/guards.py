@@ -6,20 +6,19 @@ servo must not stop an arm that has learned to do without it.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
 import numpy as np
 from jaxtyping import Int
 
-from muxjax.hardware.encoders import COUNTS_PER_RAD
-from muxjax.hardware.protocol import SERVO_BITS_PER_RAD, Fault, Reason
+from muxjax.hardware.protocol import Fault, Reason
 
 if TYPE_CHECKING:
     from muxjax.hardware.virtual_board import VirtualBoard
 
 PATIENCE = 3  # looks in a row at which a servo is silent or strained
+COMPARE_EVERY = 4  # looks: a window takes a wheel 0.11 s at full speed
 FOLLOW = 0.5  # a wheel that goes less of its way than this stands still
 WINDOW_COUNTS = 26  # way over which that is judged, 0.25 mm; slower ones wait for it
 
@@ -53,6 +52,7 @@ class Guards:
     def __init__(self) -> None:
         self._silent: dict[int, int] = {}  # servo: looks in a row
         self._strained: dict[int, int] = {}
+        self._looks = 0
         self._mark: tuple[Int[np.ndarray, " J"], Int[np.ndarray, " n"]] | None = None
 
     def begin_move(self, board: VirtualBoard) -> None:
@@ -76,7 +76,8 @@ class Guards:
         failed = board.senses.failed_wheels() & set(used.values())
         if failed:
             raise Trip(Reason.ENCODER_FAULT, min(failed) + 1)
-        if self._mark is not None:
+        self._looks += 1
+        if self._mark is not None and self._looks % COMPARE_EVERY == 0:
             self._compare(board, used)
 
     def _last(self, seen: dict[int, int], now: set[int], reason: Reason) -> None:
@@ -92,15 +93,12 @@ class Guards:
         """Whether wheels follow their servos; each window begins where the last one ended."""
         assert self._mark is not None  # the caller looks
         servos, wheels = board.senses.servo_bits(), board.senses.wheel_counts()
-        ways = (servos - self._mark[0]) / SERVO_BITS_PER_RAD * COUNTS_PER_RAD
-        ways = ways / float(board.robot.gear_ratio)
         for servo, tendon in used.items():
-            way = float(ways[servo])
+            way = float(servos[servo] - self._mark[0][servo]) * board.counts_per_bit
             if abs(way) < board.window_counts:
                 continue
-            if math.copysign(1, way) * float(wheels[tendon] - self._mark[1][tendon]) < FOLLOW * abs(
-                way
-            ):
+            followed = float(wheels[tendon] - self._mark[1][tendon]) / way
+            if followed < FOLLOW:
                 raise Trip(Reason.WHEEL_STILL, tendon + 1)
             self._mark[0][servo] = servos[servo]
             self._mark[1][tendon] = wheels[tendon]

@@ -18,7 +18,7 @@ from muxjax.scheduler import Program
 
 START_TOLERANCE_MM = 0.5  # how far the wheels may stand from program.start
 RESUME_TOLERANCE_MM = 2.0  # and from where the journal left them: clutches that dropped out slip
-TAKEOVER_S = 1.0  # the watchdog has disarmed a dead host's board by then
+TAKEOVER_S = 1.0  # by then a board is up, and its watchdog has let go of a host that died
 READING_TRIES = 12
 READING_S = 0.1  # for one frame of every stream, right after it began anew
 MIN_VOLTAGE_V = 18.0  # below this a 24 V servo has not its torque
@@ -98,7 +98,7 @@ class Handshake(Session):
         self.checks = self._preflight(expected)
         for check in self.checks:
             if not check.passed:
-                self._refuse(check)
+                self._refuse(check, expected)
         self.phase = "arming"
         self._beat()  # the board arms nobody whose heart it has not heard since HELLO
         yield from self._command(Op.ARM, arg=self.session)
@@ -113,17 +113,24 @@ class Handshake(Session):
         )
 
     def _greet(self) -> Script[None]:
-        """HELLO as soon as the board's watchdog has let go of a host that died."""
+        """HELLO, as soon as the board is up or its watchdog has let go of a host that died."""
         deadline = self._now + TAKEOVER_S
+        hello = VERSION << 16 | self.session
         while True:
-            reason = yield from self._command(
-                Op.HELLO, arg=VERSION << 16 | self.session, may=(Reason.ARMED_ALREADY,)
-            )
-            if reason is Reason.NONE:
-                break
+            try:
+                reason = yield from self._command(Op.HELLO, arg=hello, may=(Reason.ARMED_ALREADY,))
+                if reason is Reason.NONE:
+                    break
+                trouble = Failed(
+                    "HELLO: the board is armed by another host that lives", After.RESUME
+                )
+                yield from self._pause(TAKEOVER_S / 20)
+            except Failed as failure:
+                if failure.after is not After.AGAIN:
+                    raise
+                trouble = failure
             if self._now >= deadline:
-                raise Failed("HELLO: the board is armed by another host that lives", After.RESUME)
-            yield from self._pause(TAKEOVER_S / 20)
+                raise trouble
         greeted = self._now
         for number, word in enumerate(fingerprint_words(self.program.fingerprint), start=1):
             yield from self._command(Op.ROBOT, number, word)
@@ -181,8 +188,7 @@ class Handshake(Session):
 
     def _preflight(self, expected: Standing) -> tuple[Check, ...]:
         sensors, robot = self.sensors, self.robot
-        servos = [s for s in self.program.servos if s not in expected.failed_servos]
-        bad = [s for s in servos if sensors.servo_status[s - 1] & (STALLED | OFFLINE)]
+        servos, bad = self._needed_servos(expected), self._silent_servos(expected)
         inl_mm = 1e3 * math.radians(robot.config.encoder.inl_deg.value) * float(robot.wheel_radius)
         return (
             Check("protocol version", True, f"{VERSION}"),
@@ -192,7 +198,7 @@ class Handshake(Session):
             Check(
                 "servos",
                 not bad,
-                f"{bad} stalled or offline" if bad else f"{servos} answer",
+                f"{bad} stalled or offline" if bad else f"{servos} needed, they answer",
             ),
             Check("wheel encoders", True, f"{robot.n_tendons} answer"),
             Check(
@@ -210,6 +216,16 @@ class Handshake(Session):
             ),
         )
 
+    def _needed_servos(self, expected: Standing) -> list[int]:
+        """Servos of the instructions that are left."""
+        left = self.program.instructions[expected.done :]
+        return sorted({servo for instruction in left for servo in instruction.length_moves})
+
+    def _silent_servos(self, expected: Standing) -> list[int]:
+        """Those of the needed ones that say that they cannot be used, or say nothing."""
+        status = self.sensors.servo_status
+        return [s for s in self._needed_servos(expected) if status[s - 1] & (STALLED | OFFLINE)]
+
     def _lengths_check(self, expected: Standing) -> Check:
         """Whether the arm is where the program starts, or where the journal left it."""
         begun = any(isinstance(entry, SessionEntry) for entry in self.journal.entries)
@@ -224,11 +240,13 @@ class Handshake(Session):
             f"{limit:g} mm",
         )
 
-    def _refuse(self, check: Check) -> None:
+    def _refuse(self, check: Check, expected: Standing) -> None:
         text = f"{check.name}: {check.detail}"
         if check.name in ("program.start", "lengths"):
             raise Wrong(text)
-        raise Failed(text, After.REPAIR if check.name == "servos" else After.RESUME)
+        if check.name == "servos":
+            raise Failed(text, After.REPAIR, servo=self._silent_servos(expected)[0])
+        raise Failed(text, After.RESUME)
 
 
 def _interval(

@@ -12,7 +12,8 @@ import logging
 import secrets
 import time
 from collections import Counter
-from collections.abc import Collection, Iterable
+from collections.abc import Collection, Iterable, Iterator
+from contextlib import contextmanager, suppress
 from typing import TYPE_CHECKING, Protocol, runtime_checkable
 
 import numpy as np
@@ -31,6 +32,7 @@ if TYPE_CHECKING:
 
 AT_ONCE = 64  # frames taken from a bus before the executor looks at them
 ERROR_PAUSE_S = 0.001
+SEND_S = 0.01  # a bus that takes a frame later than this has lost it
 
 
 @runtime_checkable
@@ -154,7 +156,7 @@ class BusLink:
         stream_divider: As for ``LockstepLink``; for slow serial links.
 
     Attributes:
-        errors: What the bus has raised so far, counted by its text.
+        errors: What the bus has raised so far, counted by kind.
     """
 
     def __init__(self, bus: can.BusABC, robot: Robot, stream_divider: int = 1) -> None:
@@ -177,23 +179,33 @@ class BusLink:
         try:
             send_frames(self._bus, frames)
         except _bus_errors() as error:
-            self.errors[repr(error)] += 1
+            self.errors[type(error).__name__] += 1
 
     def wait(self, until: float) -> list[Frame]:
         """The frames that are there, or the first one to come by ``until`` [s]."""
         try:
             return receive_frames(self._bus, until - self.now)
         except _bus_errors() as error:
-            self.errors[repr(error)] += 1
-            time.sleep(ERROR_PAUSE_S)  # a bus that is gone raises at once, and for ever
+            self.errors[type(error).__name__] += 1
+            if isinstance(error.__cause__, UnicodeDecodeError):
+                self._forget_line()
+            time.sleep(ERROR_PAUSE_S)  # a bus that is gone raises at once
             return []
+
+    def _forget_line(self) -> None:
+        """Slcan keeps a line that it cannot read, and raises for ever; its flush drops it."""
+        flush = getattr(self._bus, "flush", None)
+        if flush is not None:
+            with suppress(*_bus_errors()):
+                flush()
 
     def trajectory(self, since: float) -> None:
         """Nobody sees the truth of a real arm."""
         return
 
 
-def open_bus(spec: str) -> can.BusABC:
+@contextmanager
+def open_bus(spec: str) -> Iterator[can.BusABC]:
     """A python-can bus, from the arguments of ``can.Bus`` or from python-can's configuration.
 
     Args:
@@ -210,10 +222,16 @@ def open_bus(spec: str) -> can.BusABC:
     logging.getLogger("can").setLevel(logging.ERROR)
     try:
         if spec.lstrip().startswith("{"):
-            return can.Bus(**json.loads(spec))
-        return can.Bus(config_context=spec)
+            bus = can.Bus(**json.loads(spec))
+        else:
+            bus = can.Bus(config_context=spec)
     except (can.CanError, TypeError, ValueError) as error:
         raise ValueError(f"bus: {spec} cannot be opened: {error}") from error
+    try:
+        yield bus
+    finally:
+        with suppress(*_bus_errors()):  # slcan writes to an adapter that may be gone
+            bus.shutdown()
 
 
 def _bus_errors() -> tuple[type[Exception], ...]:
@@ -228,7 +246,8 @@ def send_frames(bus: can.BusABC, frames: Iterable[Frame]) -> None:
     import can
 
     for frame in frames:
-        bus.send(can.Message(arbitration_id=frame.id, data=frame.data, is_extended_id=False))
+        message = can.Message(arbitration_id=frame.id, data=frame.data, is_extended_id=False)
+        bus.send(message, timeout=SEND_S)
 
 
 def receive_frames(bus: can.BusABC, timeout: float) -> list[Frame]:

@@ -265,6 +265,7 @@ class Mechanics:
 
     def _seat(self, pairs: Mapping[int, int]) -> None:
         clutch = self._physics.clutch
+        self._note()  # the record must jump here, not slope from its last point
         self.coupled.update(pairs)
         for servo, tendon in pairs.items():
             if self.coupled.get(servo) != tendon:
@@ -274,8 +275,7 @@ class Mechanics:
                 self._wind(tendon, self._slip(clutch.slip_seen_m))
             if clutch.slip_unseen_m:
                 self.displacements[tendon] += self._slip(clutch.slip_unseen_m)
-        if pairs:
-            self._note()
+        self._note()
 
     def _slip(self, about: float) -> float:
         return about * float(self._rng.uniform(0.8, 1.2) * self._rng.choice([-1, 1]))

@@ -81,7 +81,8 @@ class Senses:
         if not self.encoders.may_fail:
             return set()
         self.wheel_counts()
-        return set(np.flatnonzero(self._bad >= BAD_SAMPLES).tolist())
+        bad = self._bad >= BAD_SAMPLES
+        return set(np.flatnonzero(bad).tolist()) if bad.any() else set()
 
     def servo_bits(self) -> Int[np.ndarray, " J"]:
         """Shaft angles as the UART last heard them [0.1 degree]."""

@@ -162,6 +162,8 @@ class SocketcandWire:
     def _hear(self, client: _Client) -> list[Frame]:
         try:
             data = client.connection.recv(4096)
+            if hasattr(socket, "TCP_QUICKACK"):  # else a client may hold its next frame for 40 ms
+                client.connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_QUICKACK, 1)
         except BlockingIOError:
             return []
         except OSError:

@@ -31,6 +31,7 @@ from muxjax.hardware.interlocks import refusal
 from muxjax.hardware.mechanics import Mechanics
 from muxjax.hardware.physics import PhysicsConfig, axial_time, load_physics
 from muxjax.hardware.protocol import (
+    SERVO_BITS_PER_RAD,
     WATCHDOG_S,
     BoardState,
     Fault,
@@ -103,6 +104,8 @@ class VirtualBoard:
         self.limits = displacement_range(robot) + np.array([-RANGE_MARGIN_M, RANGE_MARGIN_M])
         play = self.physics.servo.backlash_m / float(robot.wheel_radius) * COUNTS_PER_RAD
         self.window_counts = WINDOW_COUNTS + 2 * play  # in which a wheel must follow its servo
+        ratio = float(robot.gear_ratio)
+        self.counts_per_bit = COUNTS_PER_RAD / SERVO_BITS_PER_RAD / ratio  # of wheel and servo
         self.facing = robot.axial_map.tolist()  # tendon that each servo meets, [slot][servo]
         self.words = fingerprint_words(robot.fingerprint)
         self.cut_off: set[FaultKind] = set()  # what keeps frames from the board

@@ -44,6 +44,8 @@ CASES = {
     "closed loop, slip not seen": ("realistic", 0.0, 0.0005, True),
     "closed loop, no slip": ("realistic", 0.0, 0.0, True),
 }
+DRAWN = ("open loop, realistic board", "closed loop, slip seen")
+COLOURS = ("tab:blue", "tab:orange", "tab:green")
 
 
 class OpenLoop(Executor):
@@ -222,31 +224,33 @@ def summary(trials: list[Trial], tip: int) -> list[str]:
     return cells
 
 
-def draw(robot: Robot, trials: Mapping[tuple[int, ...], list[Trial]], path: Path) -> None:
+def draw(found: Mapping[str, Mapping[tuple[int, ...], list[Trial]]], path: Path) -> None:
     """As M Fig. 7d-e: solid there, dashed back, a colour for each number of servos."""
     import matplotlib.pyplot as plt
 
-    figure = plt.figure(figsize=(10, 4.5))
-    space = figure.add_subplot(1, 2, 1, projection="3d")
-    turn = figure.add_subplot(1, 2, 2, projection="3d")
-    for colour, (servos, made) in zip(
-        ("tab:blue", "tab:orange", "tab:green"), trials.items(), strict=True
-    ):
-        one = made[0]
-        for part, style in ((slice(0, one.at_target + 1), "-"), (slice(one.at_target, None), "--")):
-            tip = one.poses[part, -1]
-            label = f"{len(servos)} servos" if style == "-" else None
-            space.plot(*(1e3 * tip[:, :3, 3]).T, style, color=colour, label=label, linewidth=1)
-            turn.plot(*tip[:, :3, 2].T, style, color=colour, linewidth=1)
-        ends = one.poses[one.at_target, :, :3, 3]
-        space.scatter(*(1e3 * ends).T, color=colour, s=14)
-        turn.scatter(*one.poses[one.at_target, -1, :3, 2], color=colour, s=14)
-    space.scatter(*(1e3 * one.planned[one.at_target, :, :3, 3]).T, color="black", marker="x")
-    space.set(xlabel="x [mm]", ylabel="y [mm]", zlabel="z [mm]", title="tip (dots: section ends)")
-    turn.set(xlabel="x", ylabel="y", zlabel="z", title="direction of the tip's axis")
-    space.legend(loc="upper left", fontsize=8)
+    figure = plt.figure(figsize=(10, 4.5 * len(found)))
+    for row, (case, trials) in enumerate(found.items()):
+        space, turn = (
+            figure.add_subplot(len(found), 2, 2 * row + k, projection="3d") for k in (1, 2)
+        )
+        for colour, (servos, made) in zip(COLOURS, trials.items(), strict=True):
+            one = made[0]
+            there, back = slice(0, one.at_target + 1), slice(one.at_target, None)
+            for part, style in ((there, "-"), (back, "--")):
+                tip = one.poses[part, -1]
+                label = f"{len(servos)} servos" if style == "-" else None
+                space.plot(*(1e3 * tip[:, :3, 3]).T, style, color=colour, label=label, linewidth=1)
+                turn.plot(*tip[:, :3, 2].T, style, color=colour, linewidth=1)
+            space.scatter(*(1e3 * one.poses[one.at_target, :, :3, 3]).T, color=colour, s=14)
+            turn.scatter(*one.poses[one.at_target, -1, :3, 2], color=colour, s=14)
+        wanted = one.planned[one.at_target]
+        space.scatter(*(1e3 * wanted[:, :3, 3]).T, color="black", marker="x")
+        turn.scatter(*wanted[-1, :3, 2], color="black", marker="x")
+        space.set(xlabel="x [mm]", ylabel="y [mm]", zlabel="z [mm]", title=f"tip: {case}")
+        turn.set(xlabel="x", ylabel="y", zlabel="z", title=f"direction of its axis: {case}")
+        space.legend(loc="upper left", fontsize=8)
     figure.tight_layout()
-    figure.savefig(path, dpi=110)
+    figure.savefig(path, dpi=90)
     plt.close(figure)
 
 
@@ -266,7 +270,7 @@ def main() -> None:
         rows.append([case, "all", *summary(every, tip)])
     sections = [f"section {k + 1} at the target" for k in range(tip)]
     print(table(["case", "servos", "tip at the target", "tip, whole motion", *sections], rows))
-    draw(robot, found["closed loop, slip seen"], options.picture)
+    draw({case: found[case] for case in DRAWN}, options.picture)
 
 
 if __name__ == "__main__":

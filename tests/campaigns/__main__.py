@@ -4,27 +4,18 @@ from __future__ import annotations
 
 import argparse
 import sys
-import time
 from collections import Counter
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context
 
 import numpy as np
 
 import muxjax
-from tests.campaigns.campaign import Verdict, run
+from tests.campaigns.campaign import Verdict, play, run
 from tests.campaigns.scenario import draw
 
 CHUNK = 25
-
-
-def play(seeds: Iterable[int]) -> tuple[list[Verdict], float]:
-    """Verdicts of some seeds, and the CPU time that they took [s]."""
-    robot = muxjax.load_robot("muxarm")
-    begin = time.process_time()
-    verdicts = [run(robot, draw(robot, seed)) for seed in seeds]
-    return verdicts, time.process_time() - begin
 
 
 def played(first: int, runs: int, workers: int) -> Iterator[tuple[list[Verdict], float]]:

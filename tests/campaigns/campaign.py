@@ -3,18 +3,22 @@
 from __future__ import annotations
 
 import math
+import time
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 
 import numpy as np
 
+import muxjax
 from muxjax.hardware import LockstepLink, MemoryJournal, Run
+from muxjax.hardware.encoders import COUNTS_PER_RAD
 from muxjax.hardware.faults import FaultKind
 from muxjax.hardware.protocol import BoardState, Frame
 from muxjax.pipeline import run_to_target
 from muxjax.robot import Robot
 from muxjax.scheduler import Program, waypoints
 from tests.campaigns.judge import Judge
-from tests.campaigns.scenario import Scenario
+from tests.campaigns.scenario import Scenario, draw
 
 END_M = 2e-5  # of measured wheel length
 RETURNS = 8  # how often the operator lets a run go on
@@ -33,15 +37,22 @@ class MortalLink(LockstepLink):
     """A link whose host is killed at certain times.
 
     Attributes:
-        kills: Times left [s].
+        kills: Those left: when [s], and whether before the host sends (or else while it waits).
     """
 
-    kills: tuple[float, ...] = ()
+    kills: tuple[tuple[float, bool], ...] = ()
+
+    def send(self, frames: Iterable[Frame]) -> None:
+        """As ever, unless the host dies with the frames in its hands."""
+        if self.kills and self.kills[0][1] and self.now >= self.kills[0][0] and list(frames):
+            self.kills = self.kills[1:]
+            raise HostKilled
+        super().send(frames)
 
     def wait(self, until: float) -> list[Frame]:
         """As ever, unless the host does not live to see it."""
-        if self.kills and self.kills[0] <= until:
-            at, self.kills = self.kills[0], self.kills[1:]
+        if self.kills and not self.kills[0][1] and self.kills[0][0] <= until:
+            (at, _), self.kills = self.kills[0], self.kills[1:]
             super().wait(max(at, self.now))
             raise HostKilled
         return super().wait(until)
@@ -117,9 +128,9 @@ def _host(scenario: Scenario, link: MortalLink, verdict: Verdict) -> Run | None:
             continue
         verdict.steps.append(f"{link.now:.2f} s: {last.reason}; failed {last.failed_servos}")
         verdict.reason = last.reason
-        if last.completed or not last.resumable:
+        if last.completed or (not last.resumable and scenario.lasting):
             return last
-        _operator(link)
+        _operator(link)  # who has repaired by then what does not last
     return last
 
 
@@ -133,7 +144,7 @@ def _operator(link: MortalLink) -> None:
     _pass(link, BOOT_S)
     if board.coils.temperature > board.physics.coil.limit_c:
         _pass(link, COOLING_S)
-    link.kills = tuple(t for t in kills if t > link.now)
+    link.kills = tuple(kill for kill in kills if kill[0] > link.now)
 
 
 def _pass(link: MortalLink, seconds: float) -> None:
@@ -150,8 +161,8 @@ def _judge_end(
     samples = []
     for _ in range(16):  # a fresh look with the sensors' noise averaged out
         _pass(link, 0.01)
-        samples.append(board.senses.displacements())
-    measured = np.mean(samples, axis=0)
+        samples.append([board.senses.raw(c) for c in range(len(goals))])  # turns never lost
+    measured = np.mean(samples, axis=0) / COUNTS_PER_RAD * float(board.robot.wheel_radius)
     verdict.measured_mm = 1e3 * float(np.abs(measured - goals).max())
     verdict.true_mm = 1e3 * float(np.abs(board.mechanics.displacements - goals).max())
     if not judge.at_rest and not board.mechanics.stuck_plugs:
@@ -166,7 +177,7 @@ def _judge_end(
         if verdict.measured_mm > 1e3 * END_M:
             verdict.offences.append(f"completed {verdict.measured_mm:.4f} mm off")
         return
-    if any(word in verdict.reason for word in scenario.true_reasons):
+    if scenario.lasting and any(word in verdict.reason for word in scenario.true_reasons):
         verdict.ending = "safe"
     else:
         kinds = ", ".join(scenario.lasting) or "nothing lasting"
@@ -176,3 +187,11 @@ def _judge_end(
 def _ways(robot: Robot, program: Program) -> np.ndarray:
     """How far each tendon goes in a program [m]."""
     return sum(np.abs(np.diff(points, axis=0)).sum(axis=0) for points in waypoints(robot, program))
+
+
+def play(seeds: Iterable[int]) -> tuple[list[Verdict], float]:
+    """Verdicts of some seeds, and the CPU time that they took [s]."""
+    robot = muxjax.load_robot("muxarm")
+    begin = time.process_time()
+    verdicts = [run(robot, draw(robot, seed)) for seed in seeds]
+    return verdicts, time.process_time() - begin

@@ -13,10 +13,9 @@ from muxjax.robot import Robot
 from muxjax.scheduler import Instruction, Program
 from muxjax.tendons import displacement_range, tendon_displacements
 
-# A clutch that slips once is over, but whoever sees a wheel stand still cannot know that.
-SLIPPED = ("WHEEL_STILL", "its wheel moved")
 # What ends by itself or by an operator's hand, and after how long at most [s].
 PASSING: dict[FaultKind, float] = {
+    FaultKind.SERVO_STALL: 1.0,  # an overload: the host goes on without the servo all the same
     FaultKind.CLUTCH_SLIP: 0.0,
     FaultKind.ENCODER_PARITY: 1.0,
     FaultKind.COIL_HEAT: 3.0,
@@ -36,6 +35,11 @@ LASTING: dict[FaultKind, tuple[str, ...]] = {
     FaultKind.ENCODER_PARITY: ("ENCODER_FAULT", "encoder"),
     FaultKind.ENCODER_MAGNET: ("ENCODER_FAULT", "encoder"),
 }
+# What is over when it is reported, but whoever reports it cannot know that: it is to be repaired.
+REPORTED: dict[FaultKind, tuple[str, ...]] = {
+    **LASTING,
+    FaultKind.CLUTCH_SLIP: ("WHEEL_STILL", "its wheel moved"),
+}
 TRIGGERS = ("AXIAL", "ENGAGE", "START", "RELEASE")
 
 
@@ -49,7 +53,8 @@ class Scenario:
         program: What is to be run.
         axial: Axial position at power-up, from 1; None if unknown.
         faults: Of the board's parts.
-        kills: Times at which the host is killed [s].
+        kills: When the host is killed [s], and whether before it sends what it then decides (or
+            else while it waits).
         stream_divider: Of the feedback.
     """
 
@@ -58,7 +63,7 @@ class Scenario:
     program: Program
     axial: int | None
     faults: tuple[FaultConfig, ...]
-    kills: tuple[float, ...]
+    kills: tuple[tuple[float, bool], ...]
     stream_divider: int
 
     @property
@@ -69,8 +74,8 @@ class Scenario:
     @property
     def true_reasons(self) -> tuple[str, ...]:
         """Words of which a run that stops for good must give one."""
-        slips = any(f.kind is FaultKind.CLUTCH_SLIP for f in self.faults)
-        return (*(w for kind in self.lasting for w in LASTING[kind]), *(SLIPPED if slips else ()))
+        kinds = {f.kind for f in self.faults if f.kind in REPORTED}
+        return tuple(word for kind in sorted(kinds) for word in REPORTED[kind])
 
 
 def draw(robot: Robot, seed: int) -> Scenario:
@@ -88,14 +93,18 @@ def draw(robot: Robot, seed: int) -> Scenario:
     at_the_limit = rng.random() < 0.15
     program = _draw_program(robot, rng, at_the_limit)
     kills = np.cumsum(rng.uniform(0.0, 20.0, int(rng.choice([0, 0, 1, 2]))))
+    axial = int(rng.integers(1, 10)) if rng.random() < 0.5 else None
+    faults = _draw_faults(robot, rng, replanning=not at_the_limit)
+    divider = int(rng.choice([2, 4, 10]))
+    unsent = rng.random(len(kills)) < 0.5
     return Scenario(
         seed=seed,
         physics=physics.model_copy(update={"bus": bus}),
         program=program,
-        axial=int(rng.integers(1, 10)) if rng.random() < 0.5 else None,
-        faults=_draw_faults(robot, rng, lasting=not at_the_limit),
-        kills=tuple(kills.tolist()),
-        stream_divider=int(rng.choice([2, 4, 10])),
+        axial=axial,
+        faults=faults,
+        kills=tuple(zip(kills.tolist(), unsent.tolist(), strict=True)),
+        stream_divider=divider,
     )
 
 
@@ -144,14 +153,17 @@ def _instruction(robot: Robot, axial: int, servos: np.ndarray, legs: np.ndarray)
     )
 
 
-def _draw_faults(robot: Robot, rng: np.random.Generator, lasting: bool) -> tuple[FaultConfig, ...]:
-    """None to two that pass, and, where it may be, in every third run one that lasts."""
+def _draw_faults(
+    robot: Robot, rng: np.random.Generator, replanning: bool
+) -> tuple[FaultConfig, ...]:
+    """None to two that pass, and, where one can plan anew, in every third run one that lasts."""
     faults = []
     for _ in range(int(rng.choice([0, 1, 1, 2]))):
-        kind = FaultKind(rng.choice([k.value for k in PASSING]))
+        kinds = [k.value for k in PASSING if replanning or k is not FaultKind.SERVO_STALL]
+        kind = FaultKind(rng.choice(kinds))
         for_s = float(rng.uniform(0.05, PASSING[kind])) if PASSING[kind] else None
         faults.append(_fault(robot, rng, kind, for_s))
-    if lasting and rng.random() < 1 / 3:
+    if replanning and rng.random() < 1 / 3:
         faults.append(_fault(robot, rng, FaultKind(rng.choice([k.value for k in LASTING])), None))
     return tuple(faults)
 

@@ -18,7 +18,8 @@ import numpy as np
 
 from muxjax.hardware import protocol
 from muxjax.hardware.codec import database
-from muxjax.hardware.guards import FOLLOW, PATIENCE, WINDOW_COUNTS
+from muxjax.hardware.encoders import COUNTS_PER_RAD
+from muxjax.hardware.guards import COMPARE_EVERY, FOLLOW, PATIENCE, WINDOW_COUNTS
 from muxjax.hardware.physics import PhysicsConfig
 from muxjax.hardware.sensing import BAD_SAMPLES
 from muxjax.hardware.virtual_board import (
@@ -134,6 +135,7 @@ def config_source(robot: Robot, physics: PhysicsConfig) -> str:
         "brake_ms": physics.brake_s,
     }
     controller = physics.controller
+    play = physics.servo.backlash_m / float(robot.wheel_radius) * COUNTS_PER_RAD  # as the board has
     coil = robot.config.clutch.coil_current_a.value
     fields = {
         "words": _list(f"0x{word:04X}" for word in words),
@@ -161,7 +163,8 @@ def config_source(robot: Robot, physics: PhysicsConfig) -> str:
         "horizon_ms": math.floor(controller.horizon_s * 1e3 + 1e-6),
         "lowest_voltage": round(100 * controller.lowest_v),
         "hottest_coil": math.floor(physics.coil.limit_c) + 40,
-        "window_counts": _number(WINDOW_COUNTS),
+        "window_counts": _number(WINDOW_COUNTS + 2 * play),
+        "compare_every": COMPARE_EVERY,
         "follow": _number(FOLLOW),
         "patience": PATIENCE,
         "bad_samples": BAD_SAMPLES,

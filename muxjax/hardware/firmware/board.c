@@ -1115,7 +1115,7 @@ static void guard(struct board *b)
         trip(b, TDMA_REASON_COIL_HOT, 0);
         return;
     }
-    uint16_t silent = 0, strained = 0, failed = 0, still = 0; /* servos */
+    uint16_t silent = 0, strained = 0, failed = 0; /* servos */
     for (uint8_t s = 0; s < b->config->servos && b->position >= 0; s++) {
         uint8_t tendon = facing(b, s);
         bool used = b->energised[tendon];
@@ -1126,7 +1126,6 @@ static void guard(struct board *b)
         silent |= lasts(&b->servo_silent[s], used && offline, b->config->patience) ? bit : 0u;
         strained |= lasts(&b->servo_strained[s], used && stalled, b->config->patience) ? bit : 0u;
         failed |= used && b->wheel_bad[tendon] >= b->config->bad_samples ? bit : 0u;
-        still |= used && b->comparing && !follows(b, s, tendon) ? bit : 0u;
     }
     for (uint8_t s = 0; s < b->config->servos; s++) {
         if (silent >> s & 1u) {
@@ -1148,9 +1147,14 @@ static void guard(struct board *b)
             }
         }
     }
+    b->looks++;
+    if (!b->comparing || b->looks % b->config->compare_every != 0) {
+        return;
+    }
     for (uint8_t s = 0; s < b->config->servos; s++) {
-        if (still >> s & 1u) {
-            trip(b, TDMA_REASON_WHEEL_STILL, (uint8_t)(facing(b, s) + 1));
+        uint8_t tendon = facing(b, s);
+        if (b->energised[tendon] && !follows(b, s, tendon)) {
+            trip(b, TDMA_REASON_WHEEL_STILL, (uint8_t)(tendon + 1));
             return;
         }
     }

@@ -46,6 +46,7 @@ struct board_config {
     uint8_t hottest_coil;        /* CLUTCH_FB's raw value; above it likewise */
     double window_counts;        /* wheel way over which it is compared with its servo's */
     double follow;               /* a wheel that goes less of its way stands still */
+    uint8_t compare_every;       /* looks at which wheels are compared with their servos */
     uint8_t patience;            /* looks in a row at which a servo is silent or strained */
     uint8_t bad_samples;         /* of an encoder in a row that are a fault */
 };
@@ -161,6 +162,7 @@ struct board {
     bool moving; /* servos are on a line from move_from to move_to */
     int32_t move_from[TDMA_MAX_SERVOS], move_to[TDMA_MAX_SERVOS];
     uint32_t move_begin, move_ms, move_fed;
+    uint32_t looks;
     bool comparing; /* wheels with their servos, from these marks on */
     int32_t mark_servo[TDMA_MAX_SERVOS], mark_wheel[TDMA_MAX_SERVOS];
 };

@@ -426,6 +426,7 @@ def mutants() -> list[Mutant]:
         limit(guards, "PATIENCE", 2),
         limit(guards, "PATIENCE", 30),
         limit(guards, "FOLLOW", 0.0),
+        limit(guards, "COMPARE_EVERY", 100),
         limit(virtual_board, "WINDOW_COUNTS", 20 * guards.WINDOW_COUNTS),
         limit(importlib.import_module("muxjax.hardware.sensing"), "BAD_SAMPLES", 2),
         limit(importlib.import_module("muxjax.hardware.sensing"), "BAD_SAMPLES", 30),

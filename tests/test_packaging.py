@@ -11,18 +11,24 @@ from pathlib import Path
 CHECKOUT = Path(__file__).resolve().parent.parent
 
 USE_IT = """
+import tempfile
+from pathlib import Path
 import muxjax
 from envs.config import load_env_config
 from envs.tdma import Tdma
 from muxjax.config import TaskConfig, load_yaml, resolve
 from muxjax.hardware import load_physics
 from muxjax.hardware.codec import database
+from muxjax.hardware.firmware import write_firmware
 print(muxjax.__file__)
 for name in ("muxarm", "penta"):
     print(muxjax.load_robot(name).config.fingerprint)
 print(len(load_yaml(TaskConfig, resolve("fig9a", "tasks")).targets))
 print(muxjax.Problem([0.0], [0.0], preset="paper").cost_weights["travel"], load_physics("ideal"))
 print(len(database().messages))
+with tempfile.TemporaryDirectory() as folder:
+    files = write_firmware(Path(folder), muxjax.load_robot("muxarm"), load_physics("ideal"))
+    print([path.name for path in files], sum(len(path.read_text()) for path in files))
 print(Tdma(load_env_config("muxarm")).n_actions)
 """
 

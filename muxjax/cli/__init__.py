@@ -1,4 +1,4 @@
-"""The command line: ``muxjax board | bench | demo | fk | ik | plan | resume | run | ...``.
+"""The command line: ``muxjax bench | board | conformance | demo | firmware | fk | ik | ...``.
 
 A person types and reads millimetres and degrees; ``--json`` prints SI units for a machine. The exit
 code is 0 on success, 1 where a pose was not reached or a run did not complete, 2 on bad input.
@@ -19,6 +19,7 @@ import tyro
 from muxjax.cli.bench import bench
 from muxjax.cli.board import board
 from muxjax.cli.demo import demo
+from muxjax.cli.hardware import conformance, firmware
 from muxjax.cli.plans import plan
 from muxjax.cli.poses import fk, ik
 from muxjax.cli.runs import resume, run
@@ -31,7 +32,9 @@ from muxjax.planning import PlanningError
 COMMANDS: dict[str, Callable[..., Any]] = {
     "bench": bench,
     "board": board,
+    "conformance": conformance,
     "demo": demo,
+    "firmware": firmware,
     "fk": fk,
     "ik": ik,
     "plan": plan,

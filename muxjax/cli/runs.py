@@ -21,6 +21,7 @@ from muxjax.cli.progress import Reporter
 from muxjax.hardware import BusLink, Journal, Link, LockstepLink, MemoryJournal, Progress, Run
 from muxjax.hardware.links import open_bus
 from muxjax.hardware.log import LoggedLink
+from muxjax.hardware.mapping import MappedLink, Translation
 from muxjax.pipeline import plan_to_pose, run_to_target
 from muxjax.program_file import load_program
 from muxjax.robot import Robot, load_robot
@@ -45,6 +46,7 @@ def run(
     journal: Path | None = None,
     log: Path | None = None,
     stream_divider: int = 1,
+    mapping: Path | None = None,
     json: bool = False,
 ) -> int:
     """Execute a program, or plan to a pose and execute that, on the virtual board or on a bus.
@@ -74,6 +76,7 @@ def run(
         journal: File for muxjax resume; on a bus run.journal by default.
         log: File for every frame of the run, as candump -L writes it.
         stream_divider: Feedback at 1 / this of its rates, for slow serial links.
+        mapping: YAML file of a lab's own DBC that the board on --bus speaks.
         json: Print JSON in SI units.
     """
     if [program, xyz_mm, q_deg].count(None) != 2:
@@ -112,7 +115,9 @@ def run(
     assert bus is not None  # else not real
     path = journal or Path("run.journal")
     with Journal.open(path) as into:
-        done = on_bus(bus, arm, stream_divider, log, lambda link, tell: go(link, into, tell))
+        done = on_bus(
+            bus, arm, stream_divider, mapping, log, lambda link, tell: go(link, into, tell)
+        )
     return report(done, loaded, json, path)
 
 
@@ -123,6 +128,7 @@ def resume(
     planner: Method = "exact",
     log: Path | None = None,
     stream_divider: int = 1,
+    mapping: Path | None = None,
     json: bool = False,
 ) -> int:
     """Go on with a journal's program from where the arm is, to the same lengths.
@@ -138,6 +144,7 @@ def resume(
         planner: Method of new plans.
         log: File for every frame, as candump -L writes it; it grows if it exists.
         stream_divider: Feedback at 1 / this of its rates, for slow serial links.
+        mapping: YAML file of a lab's own DBC that the board on --bus speaks.
         json: Print JSON in SI units.
     """
     arm = load_robot(robot)
@@ -150,6 +157,7 @@ def resume(
             bus,
             arm,
             stream_divider,
+            mapping,
             log,
             lambda link, tell: run_to_target(link, into, method=planner, on_progress=tell),
         )
@@ -166,6 +174,7 @@ def on_bus(
     bus: str,
     arm: Robot,
     stream_divider: int,
+    mapping: Path | None,
     log: Path | None,
     go: Callable[[Link, Reporter], Run],
 ) -> Run:
@@ -174,7 +183,8 @@ def on_bus(
     with open_bus(bus) as opened, Reporter() as tell:
         link = BusLink(opened, arm, stream_divider)
         begin_s = time.time() - link.now
-        done = go_logged(link, log, begin_s, lambda logged: go(logged, tell))
+        ours = link if mapping is None else MappedLink(link, Translation(mapping))
+        done = go_logged(ours, log, begin_s, lambda logged: go(logged, tell))
     for kind, count in link.errors.items():
         console.print(f"bus: raised {kind} {count} times")
     return done

@@ -61,6 +61,7 @@ class CompareConfig(Strict):
         regimes: Kinds of problems; their ``problems`` are how many.
         widths: Plans a level, by what orders and bounds the beam.
         widest: Regimes where no wider beam is tried.
+        acting: Regimes in which policies act; others they were not trained for.
         baselines: Methods without a search.
         exact_gib: Memory of the exact planner [GiB]; where it needs more, it is left out.
         pairs: Methods, with their widths, whose costs are compared on the same problems.
@@ -73,6 +74,7 @@ class CompareConfig(Strict):
     regimes: tuple[Regime, ...]
     widths: dict[str, tuple[Annotated[int, Field(ge=1)], ...]]
     widest: dict[str, Annotated[int, Field(ge=1)]] = Field(default_factory=dict)
+    acting: tuple[str, ...] = ()
     baselines: tuple[str, ...]
     exact_gib: Annotated[float, Field(gt=0)]
     pairs: tuple[tuple[str, str], ...]
@@ -151,6 +153,7 @@ def main(options: Options) -> None:
         if options.only and regime.name not in options.only:
             continue
         widest = config.widest.get(regime.name, WIDEST)
+        acting = policies if regime.name in config.acting else {}
         for number, problem in enumerate(problems[regime.name]):
             kept = options.out / f"{regime.name}_{number:03d}.json"
             if kept.is_file():
@@ -158,7 +161,7 @@ def main(options: Options) -> None:
                 continue
             found = [
                 record(robot, problem, regime.name, number, *method)
-                for method in methods(config, widest, nets, policies)
+                for method in methods(config, widest, nets, acting)
             ]
             kept.write_text(json.dumps([asdict(r) for r in found]))
             records += found
@@ -209,7 +212,8 @@ def methods(
             if width <= widest:
                 yield f"{name} {width}", net_name, partial(_beam, heuristic, width, net)
     for name, policy in policies.items():
-        yield METHOD, name, partial(_whole, partial(_acted, policy))
+        trained_in = Path(name).name.rsplit("_", 1)[0]  # the rest tells the seed
+        yield f"{METHOD} {trained_in}", name, partial(_whole, partial(_acted, policy))
 
 
 def _whole(method: Callable[[Lattice], Plan], lattice: Lattice) -> Outcome:

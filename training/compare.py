@@ -125,6 +125,7 @@ class Options:
         nets: Checkpoints, one for each seed of the training.
         policies: Folders of trainings of policies, one for each seed.
         only: Regimes to run; all by default.
+        guides: What orders the beam; all of the file by default.
         draw: Draw the problems and write their file, and nothing else.
     """
 
@@ -133,6 +134,7 @@ class Options:
     nets: tuple[str, ...] = ()
     policies: tuple[Path, ...] = ()
     only: tuple[str, ...] = ()
+    guides: tuple[str, ...] = ()
     draw: bool = False
 
 
@@ -141,6 +143,9 @@ def main(options: Options) -> None:
     config = load_yaml(CompareConfig, options.config)
     robot = muxjax.load_robot(config.robot)
     file = options.config.parent / config.problems
+    if options.guides:
+        widths = {name: config.widths[name] for name in options.guides}
+        config = config.model_copy(update={"widths": widths})
     if options.draw:
         write_problems(file, robot, drawn_problems(robot, config))
         return

@@ -21,7 +21,7 @@ ORDER = [
     {"config"},
     {"precision"},
     {"robot"},
-    {"kinematics"},
+    {"kinematics", "bom"},
     {"tendons"},
     {"batched"},
     {"statics", "collision"},

@@ -28,7 +28,7 @@ ORDER = [
     {"workspace", "planning"},
     {"ik", "scheduler"},
     {"metrics", "hardware", "program_file"},
-    {"pipeline", "viz"},
+    {"pipeline", "viz", "schemas"},
     {"cli"},
     {"__init__", "__main__"},
 ]

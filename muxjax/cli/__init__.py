@@ -1,4 +1,4 @@
-"""The command line: ``muxjax bench | board | bom | conformance | demo | firmware | ...``.
+"""The command line: ``muxjax bench | board | bom | config | conformance | demo | ...``.
 
 A person types and reads millimetres and degrees; ``--json`` prints SI units for a machine. The exit
 code is 0 on success, 1 where a pose was not reached or a run did not complete, 2 on bad input.
@@ -19,6 +19,7 @@ import tyro
 from muxjax.cli.bench import bench
 from muxjax.cli.board import board
 from muxjax.cli.bom import bom
+from muxjax.cli.config import config
 from muxjax.cli.demo import demo
 from muxjax.cli.hardware import conformance, firmware
 from muxjax.cli.plans import plan
@@ -34,6 +35,7 @@ COMMANDS: dict[str, Callable[..., Any]] = {
     "bench": bench,
     "board": board,
     "bom": bom,
+    "config": config,
     "conformance": conformance,
     "demo": demo,
     "firmware": firmware,

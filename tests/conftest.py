@@ -30,6 +30,7 @@ SHAPED = [
     "metrics",
     "pipeline",
     "statics",
+    "urdf",
 ]
 install_import_hook([f"muxjax.{room}" for room in SHAPED], "beartype.beartype")
 

@@ -22,7 +22,7 @@ ORDER = [
     {"precision"},
     {"robot"},
     {"kinematics", "bom"},
-    {"tendons"},
+    {"tendons", "urdf"},
     {"batched"},
     {"statics", "collision"},
     {"workspace", "planning"},

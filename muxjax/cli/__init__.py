@@ -28,6 +28,7 @@ from muxjax.cli.runs import resume, run
 from muxjax.cli.statics import statics
 from muxjax.cli.sweep import sweep
 from muxjax.cli.task import task
+from muxjax.cli.urdf import urdf
 from muxjax.ik import IkError
 from muxjax.planning import PlanningError
 
@@ -47,6 +48,7 @@ COMMANDS: dict[str, Callable[..., Any]] = {
     "sweep": sweep,
     "statics": statics,
     "task": task,
+    "urdf": urdf,
 }
 
 

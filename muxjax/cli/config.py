@@ -70,7 +70,7 @@ def _print_kinds() -> None:
 
 
 def check(files: Annotated[tuple[Path, ...], tyro.conf.Positional], json: bool = False) -> int:
-    """Check YAML files, each by the kind that its "schema:" line names; exit code 2 for a wrong one.
+    """Check YAML files, by the kind that its "schema:" line names; exit code 2 if one is wrong.
 
     Example: muxjax config check my_arm.yaml my_world.yaml
 

@@ -31,6 +31,7 @@ SHAPED = [
     "pipeline",
     "statics",
     "urdf",
+    "trajectory_file",
 ]
 install_import_hook([f"muxjax.{room}" for room in SHAPED], "beartype.beartype")
 

@@ -27,7 +27,7 @@ ORDER = [
     {"statics", "collision"},
     {"workspace", "planning"},
     {"ik", "scheduler"},
-    {"metrics", "hardware", "program_file"},
+    {"metrics", "hardware", "program_file", "plan_file", "trajectory_file"},
     {"pipeline", "viz", "schemas"},
     {"cli"},
     {"__init__", "__main__"},

@@ -45,8 +45,8 @@ def chain_pose(text: str, angles: dict[str, float]) -> np.ndarray:
     return pose
 
 
-def errors(robot: muxjax.Robot, q: np.ndarray, per_segment: int) -> tuple[float, float]:
-    """Worst distance [m] and angle [rad] of the chain's tool from the formulas'."""
+def errors(robot: muxjax.Robot, q: np.ndarray, per_segment: int) -> np.ndarray:
+    """Distances [m] and angles [rad] of the chain's tool from the formulas', shape (2, rows)."""
     text, names = urdf(robot, per_segment), urdf_joints(robot, per_segment)
     angles = urdf_joint_angles(robot, q, per_segment)
     off = []
@@ -54,14 +54,19 @@ def errors(robot: muxjax.Robot, q: np.ndarray, per_segment: int) -> tuple[float,
         pose = chain_pose(text, dict(zip(names, row.tolist(), strict=True)))
         turn = Rotation.from_matrix(true[:3, :3].T @ pose[:3, :3]).magnitude()
         off.append((np.linalg.norm(pose[:3, 3] - true[:3, 3]), turn))
-    worst = np.max(off, axis=0)
-    return float(worst[0]), float(worst[1])
+    return np.array(off).T
+
+
+def worst(robot: muxjax.Robot, q: np.ndarray, per_segment: int) -> tuple[float, float]:
+    """The greatest distance [m] and angle [rad]."""
+    position, turn = np.max(errors(robot, q, per_segment), axis=1).tolist()
+    return position, turn
 
 
 def test_the_chain_comes_to_the_arms_pose_as_resolution_rises(robot, rng):
     """At least with the square: a quarter at twice the joints, a sixteenth at four times."""
     q = random_configurations(robot, rng, 8)
-    coarse, fine, finest = (errors(robot, q, n) for n in (8, 16, 64))
+    coarse, fine, finest = (worst(robot, q, n) for n in (8, 16, 64))
     assert finest[0] < 1e-4  # m
     assert finest[1] < 1e-4  # rad
     for a, b, c in zip(coarse, fine, finest, strict=True):
@@ -72,21 +77,21 @@ def test_the_chain_comes_to_the_arms_pose_as_resolution_rises(robot, rng):
 def test_the_order_of_the_axes_cancels_twist(muxarm, rng, monkeypatch):
     """Always x before y is another chain, ten times further off."""
     q = random_configurations(muxarm, rng, 8)
-    ours = errors(muxarm, q, 16)
+    ours = worst(muxarm, q, 16)
     monkeypatch.setattr("muxjax.urdf._axes", lambda part: "xy")
-    always = errors(muxarm, q, 16)
+    always = worst(muxarm, q, 16)
     assert always[0] > 10 * ours[0]
     assert always[1] > 10 * ours[1]
 
 
 def test_straight_arm_and_planar_bends(muxarm):
     """Straight is exact; in a coordinate plane the orientation is, at any resolution."""
-    position, turn = errors(muxarm, np.zeros((1, 6)), 3)
+    position, turn = worst(muxarm, np.zeros((1, 6)), 3)
     assert position < 1e-15
     assert turn == 0
     for azimuth in (0.0, np.pi / 2, np.pi):
         q = np.array([[1.2, azimuth, 2.0, azimuth, 0.9, azimuth]])
-        position, turn = errors(muxarm, q, 4)
+        position, turn = worst(muxarm, q, 4)
         assert turn < 1e-12
         assert 1e-4 < position < 0.05
 
@@ -96,7 +101,7 @@ def test_frames_of_base_and_tool_are_in_it(muxarm, rng):
     config["base_frame"] = {"xyz_m": [0.1, -0.2, 0.3], "rpy_deg": [10, 20, 30]}
     config["tool_frame"] = {"xyz_m": [0.01, 0.02, 0.05], "rpy_deg": [-40, 50, 60]}
     moved = muxjax.robot.robot_from_config(muxjax.config.RobotConfig.model_validate(config))
-    position, turn = errors(moved, np.zeros((1, 6)), 6)
+    position, turn = worst(moved, np.zeros((1, 6)), 6)
     assert position < 1e-12
     assert turn < 1e-12
 

@@ -21,6 +21,7 @@ from muxjax.cli.board import board
 from muxjax.cli.bom import bom
 from muxjax.cli.config import config
 from muxjax.cli.demo import demo
+from muxjax.cli.export import export
 from muxjax.cli.hardware import conformance, firmware
 from muxjax.cli.plans import plan
 from muxjax.cli.poses import fk, ik
@@ -39,6 +40,7 @@ COMMANDS: dict[str, Callable[..., Any]] = {
     "config": config,
     "conformance": conformance,
     "demo": demo,
+    "export": export,
     "firmware": firmware,
     "fk": fk,
     "ik": ik,

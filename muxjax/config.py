@@ -261,6 +261,49 @@ class EncoderConfig(Strict):
     inl_deg: Sourced[NotNegative]
 
 
+class PartConfig(Strict):
+    """One line of a cost sheet."""
+
+    name: Annotated[str, Field(min_length=1)]
+    kind: Literal["motor", "standard", "non-standard"]
+    count: Annotated[int, Field(ge=1)] | None = Field(
+        default=None, description="left out where it is not stated, as for screws"
+    )
+    price_usd: Positive = Field(description="of all of them together")
+    source: Literal["published", "derived", "assumed"]
+    why: Annotated[str, Field(min_length=3)]
+
+
+class SingleActuatorConfig(Strict):
+    """The actuator that every tendon would have of its own, without multiplexing."""
+
+    name: Annotated[str, Field(min_length=1)]
+    price_usd: Sourced[Positive] = Field(description="of one")
+
+
+class CostConfig(Strict):
+    """What the drive is built of and costs, and what the robot's makers say about that."""
+
+    parts: Annotated[tuple[PartConfig, ...], Field(min_length=1)]
+    total_usd: Sourced[Positive] | None = Field(
+        default=None, description="as stated; the parts must add up to it, to the cent"
+    )
+    single_actuator: SingleActuatorConfig
+    saving_percent: Sourced[Positive] | None = Field(
+        default=None, description="as stated, against an actuator a tendon"
+    )
+    fewer_motors_percent: Sourced[Positive] | None = Field(default=None, description="as stated")
+
+    @model_validator(mode="after")
+    def _parts_add_up(self) -> Self:
+        found = math.fsum(part.price_usd for part in self.parts)
+        if self.total_usd is not None and abs(found - self.total_usd.value) >= 0.005:
+            raise ValueError(
+                f"cost.total_usd: the parts add up to {found:.2f}, found {self.total_usd.value:.2f}"
+            )
+        return self
+
+
 class RobotConfig(Strict):
     """A time-multiplexed tendon arm as its YAML file states it."""
 
@@ -277,6 +320,7 @@ class RobotConfig(Strict):
     clutch: ClutchConfig
     encoder: EncoderConfig
     drive_strength: DriveStrengthConfig | None = None
+    cost: CostConfig | None = None
 
     @field_validator("segments")
     @classmethod
@@ -341,6 +385,17 @@ class RobotConfig(Strict):
             )
         return self
 
+    @model_validator(mode="after")
+    def _cost_names_every_motor(self) -> Self:
+        if self.cost is not None:
+            motors = sum(part.count or 0 for part in self.cost.parts if part.kind == "motor")
+            if motors != self.n_servos + 1:
+                raise ValueError(
+                    f"cost.parts: must count {self.n_servos + 1} motors, the {self.n_servos} "
+                    f"servos and the axial motor, found {motors}"
+                )
+        return self
+
     @property
     def n_segments(self) -> int:
         """S."""
@@ -373,9 +428,10 @@ class RobotConfig(Strict):
     def fingerprint(self) -> str:
         """Hash over every value (not the reasons), by which programs name their robot.
 
-        The strength of the drive is left out: the same program runs on a stronger one.
+        The strength of the drive and its cost are left out: the same program runs on a stronger
+        one, and at any price.
         """
-        values = _values_only(self.model_dump(mode="json", exclude={"drive_strength"}))
+        values = _values_only(self.model_dump(mode="json", exclude={"drive_strength", "cost"}))
         text = json.dumps(values, sort_keys=True, separators=(",", ":"))
         return hashlib.sha256(text.encode()).hexdigest()[:16]
 

@@ -30,6 +30,8 @@ SHAPED = [
     "metrics",
     "pipeline",
     "statics",
+    "urdf",
+    "trajectory_file",
 ]
 install_import_hook([f"muxjax.{room}" for room in SHAPED], "beartype.beartype")
 

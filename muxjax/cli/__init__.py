@@ -1,4 +1,4 @@
-"""The command line: ``muxjax bench | board | conformance | demo | firmware | fk | ik | ...``.
+"""The command line: ``muxjax bench | board | bom | config | conformance | demo | ...``.
 
 A person types and reads millimetres and degrees; ``--json`` prints SI units for a machine. The exit
 code is 0 on success, 1 where a pose was not reached or a run did not complete, 2 on bad input.
@@ -18,7 +18,10 @@ import tyro
 
 from muxjax.cli.bench import bench
 from muxjax.cli.board import board
+from muxjax.cli.bom import bom
+from muxjax.cli.config import config
 from muxjax.cli.demo import demo
+from muxjax.cli.export import export
 from muxjax.cli.hardware import conformance, firmware
 from muxjax.cli.plans import plan
 from muxjax.cli.poses import fk, ik
@@ -26,14 +29,18 @@ from muxjax.cli.runs import resume, run
 from muxjax.cli.statics import statics
 from muxjax.cli.sweep import sweep
 from muxjax.cli.task import task
+from muxjax.cli.urdf import urdf
 from muxjax.ik import IkError
 from muxjax.planning import PlanningError
 
 COMMANDS: dict[str, Callable[..., Any]] = {
     "bench": bench,
     "board": board,
+    "bom": bom,
+    "config": config,
     "conformance": conformance,
     "demo": demo,
+    "export": export,
     "firmware": firmware,
     "fk": fk,
     "ik": ik,
@@ -43,6 +50,7 @@ COMMANDS: dict[str, Callable[..., Any]] = {
     "sweep": sweep,
     "statics": statics,
     "task": task,
+    "urdf": urdf,
 }
 
 

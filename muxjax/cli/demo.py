@@ -36,6 +36,10 @@ def demo(
     after execution on the virtual board. Draws each target's tendon lengths and bending angles
     over time, and an animation of the arm.
 
+    Example: muxjax demo --methods exact greedy --out out/demo
+
+    Example: muxjax demo --task my_poses.yaml --robot my_arm.yaml
+
     Args:
         task: Shipped task or path of a YAML file of target poses.
         robot: Shipped robot or path of a YAML file.

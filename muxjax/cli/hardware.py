@@ -22,6 +22,8 @@ def firmware(out: Path, robot: str = "muxarm", physics: str = "ideal", json: boo
     Pack and unpack of every message, the protocol's values, the robot's constants, the CRC and a
     reference of the board's state machine; docs/real_board.md says how to use them.
 
+    Example: muxjax firmware --out board
+
     Args:
         out: Folder for the files.
         robot: Shipped robot or path of a YAML file.

@@ -16,6 +16,7 @@ from muxjax.config import TaskConfig, load_yaml, resolve
 from muxjax.kinematics import check_configuration
 from muxjax.metrics import evaluate
 from muxjax.pipeline import PathPlan, PosePlan, plan_task, plan_to_pose
+from muxjax.plan_file import save_plan as write_plan
 from muxjax.planning import Plan, Problem
 from muxjax.planning import plan as plan_steps
 from muxjax.program_file import save_program
@@ -40,6 +41,7 @@ def plan(
     max_step_mm: float | None = None,
     robot: str = "muxarm",
     out: Path | None = None,
+    save_plan: Path | None = None,
     json: bool = False,
 ) -> int:
     """Plan from the straight arm to a pose, to a configuration, or through several poses.
@@ -60,6 +62,7 @@ def plan(
         max_step_mm: Greatest tendon displacement in one step [mm]; no limit by default.
         robot: Shipped robot or path of a YAML file.
         out: Write the program here, for muxjax run.
+        save_plan: Write the plan itself here, step by step, as JSON.
         json: Print JSON in SI units.
     """
     arm = load_robot(robot)
@@ -68,13 +71,20 @@ def plan(
         raise ValueError("plan: give either --xyz-mm (a pose), --q-deg or --poses")
     if xyz_mm is None and (rpy_deg is not None or quat is not None):
         raise ValueError("plan: only --xyz-mm takes --rpy-deg or --quat")
+    if poses is not None and save_plan is not None:
+        raise ValueError("plan: --save-plan takes one plan, --poses makes several; use --out")
     if poses is not None:
         task = load_yaml(TaskConfig, resolve(poses, "tasks"))
         return _report_path(arm, task, plan_task(arm, task, method=method, **fields), out, json)
+    choice = None
     if xyz_mm is None:
-        return _report_plan(arm, plan_to_configuration(arm, q_deg, method, fields), None, out, json)
-    choice = plan_to_pose(arm, pose_argument(xyz_mm, rpy_deg, quat), method=method, **fields)
-    return _report_plan(arm, choice.plan, choice, out, json)
+        found = plan_to_configuration(arm, q_deg, method, fields)
+    else:
+        choice = plan_to_pose(arm, pose_argument(xyz_mm, rpy_deg, quat), method=method, **fields)
+        found = choice.plan
+    if save_plan is not None:
+        write_plan(found, save_plan)
+    return _report_plan(arm, found, choice, out, json)
 
 
 def plan_to_configuration(

@@ -94,6 +94,7 @@ def ik(
     """Configurations that put the tool at a pose, or at each pose of a file.
 
     Example: muxjax ik --xyz-mm 152.25 0 413.777 --rpy-deg 0 25 0 --all
+
     Example: muxjax ik --poses grasps.csv --world cabinet --json
 
     Args:

@@ -54,8 +54,11 @@ def run(
     Before a bus is opened, the virtual board runs the program. A servo that fails on the way is
     done without, from a new plan. Ctrl-C and SIGTERM stop the arm by ESTOP.
 
-    Examples: muxjax run program.json; muxjax run --planner learned --q-deg 60 0 75 180 40 0;
-    muxjax run program.json --bus lab --journal arm.journal
+    Example: muxjax run program.json
+
+    Example: muxjax run --planner learned --q-deg 60 0 75 180 40 0
+
+    Example: muxjax run program.json --bus lab --journal arm.journal
 
     Args:
         program: File written by muxjax plan --out.

@@ -56,6 +56,7 @@ def posture(
     """Posture from tendon tensions or tendon lengths, under weight and load.
 
     Example: muxjax statics posture --displacements-mm -4 0 4 0 -6 0 6 0 --mounting hanging
+
     Example: muxjax statics posture --robot muxarm --tension-n 20 0 0 0 0 0 0 0 0 --payload-kg 0.5
 
     Args:

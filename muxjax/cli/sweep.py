@@ -35,7 +35,9 @@ def sweep(
     comes to the same tables.
 
     Example: muxjax sweep --samples 1e9 --out out/muxarm
+
     Example: muxjax sweep --world cabinet --samples 3e6
+
     Example: muxjax sweep --vary "segments[1].length_m=0.12,0.15,0.18" --samples 3e6
 
     Args:

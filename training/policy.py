@@ -1,23 +1,29 @@
-"""A trained policy as a planner: its episode is a Plan like any other."""
+"""A trained policy as a planner: its episode is a Plan like any other.
+
+    python -m training.policy --folders out/rl/one_servo_0 out/rl/one_servo_1 --problems 5000
+
+prints how many of so many new problems of its environment each policy solves.
+"""
 
 from __future__ import annotations
 
 import json
 import zipfile
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
 import numpy as np
+import tyro
 from jaxtyping import Bool, Float
 from pydantic import ValidationError
 from sb3_contrib import MaskablePPO
 from stable_baselines3 import PPO
 
 from envs.config import TdmaConfig
-from envs.gymnasium_adapter import TdmaEnv, action_space, observation_space
+from envs.gymnasium_adapter import TdmaEnv, action_space, made, observation_space
 from envs.lanes import Lanes
 from envs.tdma import Tdma, servo_bits
 from muxjax.config import explain
@@ -26,8 +32,10 @@ from muxjax.planning.lattice import Lattice
 from muxjax.planning.problem import Plan, Problem, check_problem
 from muxjax.planning.replay import Step, failed, replay
 from muxjax.robot import Robot
+from training.problems import Regime, random_problem
 
 METHOD = "policy"
+EVALUATION_SEED = 1_000_003  # of the fixed problems, whatever a training's seed
 SIGNED = "signed"  # the action set of continuous actions, of which no bound is known but zero
 _OF_A_WORLD = ("collision", "clearance")  # terms that the network does not see
 
@@ -213,3 +221,48 @@ def rollouts(policy: Policy, env: Tdma, problems: Sequence[Problem]) -> Rollouts
         running &= ~found.ended
         observation = found.observation
     return Rollouts(cost, solved)
+
+
+def evaluation_problems(env: Tdma, count: int, seed: int = EVALUATION_SEED) -> list[Problem]:
+    """Fixed problems of an environment, the same for every training in it."""
+    config = env.config
+    regime = Regime(
+        name="evaluation",
+        max_step_mm=(config.max_step_mm,),
+        servo_sets=config.servo_sets,
+        weights=(config.preset if config.weights is None else dict(config.weights),),
+        worlds=(config.world,),
+        theta_rad=config.theta_rad,
+        bent=config.bent,
+    )
+    rng = np.random.default_rng(seed)
+    drawn = [random_problem(env.robot, regime, rng) for _ in range(count)]
+    return [
+        replace(
+            problem,
+            start=problem.start if problem.start.any() else env.start,
+            axial=env.problem.axial,
+            tolerance=env.problem.tolerance,
+        )
+        for problem in drawn
+    ]
+
+
+def main(folders: tuple[str, ...], problems: int = 5000, seed: int = 7) -> None:
+    """Share of new problems that each policy solves.
+
+    Args:
+        folders: Of trainings.
+        problems: How many.
+        seed: By which they are drawn.
+    """
+    for folder in folders:
+        policy = load_policy(folder)
+        env = made(policy.config.model_copy(update={"servo_failure": 0.0, "difficulty": None}))
+        drawn = evaluation_problems(env, problems, seed)
+        solved = rollouts(policy, env, drawn).solved
+        print(f"{folder}: {solved.sum()} of {problems} solved")
+
+
+if __name__ == "__main__":
+    tyro.cli(main)

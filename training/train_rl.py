@@ -15,7 +15,7 @@ import json
 import math
 import os
 import time
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -34,10 +34,7 @@ from envs.tdma import Tdma
 from muxjax.config import load_yaml
 from muxjax.planning import Problem, plan
 from training.config import RlConfig, keep_config
-from training.policy import Policy, check_fits, load_model, rollouts
-from training.problems import Regime, random_problem
-
-_EVALUATION_SEED = 1_000_003  # of the fixed problems, whatever the training's seed
+from training.policy import Policy, check_fits, evaluation_problems, load_model, rollouts
 
 
 @dataclass
@@ -197,31 +194,6 @@ class Evaluation(BaseCallback):
 
 def _score(line: dict[str, float]) -> tuple[float, float]:
     return line["solved"], -line["median_gap"]
-
-
-def evaluation_problems(env: Tdma, count: int) -> list[Problem]:
-    """Fixed problems of an environment, the same for every training in it."""
-    config = env.config
-    regime = Regime(
-        name="evaluation",
-        max_step_mm=(config.max_step_mm,),
-        servo_sets=config.servo_sets,
-        weights=(config.preset if config.weights is None else dict(config.weights),),
-        worlds=(config.world,),
-        theta_rad=config.theta_rad,
-        bent=config.bent,
-    )
-    rng = np.random.default_rng(_EVALUATION_SEED)
-    drawn = [random_problem(env.robot, regime, rng) for _ in range(count)]
-    return [
-        replace(
-            problem,
-            start=problem.start if problem.start.any() else env.start,
-            axial=env.problem.axial,
-            tolerance=env.problem.tolerance,
-        )
-        for problem in drawn
-    ]
 
 
 def _optima(env: Tdma, problems: list[Problem], path: Path) -> np.ndarray:

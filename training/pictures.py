@@ -54,9 +54,11 @@ def curves(runs: tuple[Path, ...], out: Path = Path("out/curves.png")) -> int:
         axes[0].plot(steps, middle, color=shade, label=name if first else None)
         axes[1].plot(steps, [100 * (1 - line["solved"]) for line in lines], color=shade)
     axes[0].set(ylabel="over the optimum [%]", yscale="log")
+    axes[0].yaxis.set_major_formatter("{x:g}")
     axes[0].legend(title="median; bands: quartiles")
     axes[1].set(ylabel="unsolved [%]", xlabel="environment steps [million]")
     axes[1].set_yscale("symlog", linthresh=0.5)
+    axes[1].set(ylim=(-0.1, 110), yticks=(0, 1, 10, 100), yticklabels=("0", "1", "10", "100"))
     for each in axes:
         each.grid(alpha=0.3)
     return _written(figure, out)

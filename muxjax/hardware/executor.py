@@ -25,6 +25,7 @@ from muxjax.hardware.journal import (
     ServoEntry,
 )
 from muxjax.hardware.links import Link, Trajectory
+from muxjax.hardware.pauses import no_long_pauses
 from muxjax.hardware.protocol import BoardState, Frame, Op, Reason, check_robot_fits
 from muxjax.hardware.session import AFTER, After, Failed, Script, Wrong
 from muxjax.hardware.transaction import CLUTCH_S, InstructionRecord, Transaction
@@ -164,16 +165,17 @@ def _drive(link: Link, journal: MemoryJournal, on_progress: OnProgress | None) -
     executor = Executor(link.robot, journal, link.new_session(), link.stream_divider)
     frames: list[Frame] = []
     told = -1
-    while not executor.finished:
-        try:
-            link.send(executor.step(link.now, frames))
-            if on_progress is not None and told != executor.news:
-                told = executor.news
-                on_progress(executor.progress())
-            frames = link.wait(executor.next_time)
-        except KeyboardInterrupt:
-            executor.estop("stopped from the keyboard")
-            frames = []
+    with no_long_pauses():
+        while not executor.finished:
+            try:
+                link.send(executor.step(link.now, frames))
+                if on_progress is not None and told != executor.news:
+                    told = executor.news
+                    on_progress(executor.progress())
+                frames = link.wait(executor.next_time)
+            except KeyboardInterrupt:
+                executor.estop("stopped from the keyboard")
+                frames = []
     return executor.result(link.trajectory)
 
 

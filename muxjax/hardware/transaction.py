@@ -157,13 +157,17 @@ class Transaction(Handshake):
             yield from self._move(visit, targets(goals))
         for trims in range(MAX_TRIMS + 1):
             targets = yield from self._servo_targets(visit)
-            off = self._wheel_error(visit)
+            tendon, off = self._worst_wheel(visit)
             if off <= TRIM_COUNTS:
                 return trims
             if trims < MAX_TRIMS:
                 self.phase = f"trim {trims + 1}"
                 yield from self._move(visit, targets(visit.legs[-1]))
-        raise Failed(f"a wheel is {off:.1f} counts off after {trims} trims", After.REPAIR)
+        raise Failed(
+            f"tendon {tendon}: its wheel is {off:.1f} counts off after {trims} trims: gear, clutch "
+            "or encoder",
+            After.REPAIR,
+        )
 
     def _servo_targets(self, visit: Visit) -> Script[Callable[[Mapping[int, float]], Targets]]:
         """Absolute servo angles {servo: 0.1 degree} for tendon goals {servo: m}.
@@ -187,11 +191,11 @@ class Transaction(Handshake):
 
         return targets
 
-    def _wheel_error(self, visit: Visit) -> float:
-        """Largest distance of a moved wheel from its goal [encoder counts]."""
+    def _worst_wheel(self, visit: Visit) -> tuple[int, float]:
+        """The tendon that is furthest from its goal, and how far [encoder counts]."""
         held, goals = self.sensors.displacements(), visit.legs[-1]
-        off = max(abs(held[c - 1] - goals[s]) for s, c in visit.tendons.items())
-        return float(off) / self.sensors.metres_per_count
+        off, tendon = max((abs(float(held[c - 1]) - goals[s]), c) for s, c in visit.tendons.items())
+        return tendon, off / self.sensors.metres_per_count
 
     def _move(self, visit: Visit, targets: Targets) -> Script[None]:
         """Stage every servo, start them together, see that every wheel followed its servo."""

@@ -228,7 +228,7 @@ class Handshake(Session):
 
     def _lengths_check(self, expected: Standing) -> Check:
         """Whether the arm is where the program starts, or where the journal left it."""
-        begun = any(isinstance(entry, SessionEntry) for entry in self.journal.entries)
+        begun = expected.begun
         limit = RESUME_TOLERANCE_MM if begun else START_TOLERANCE_MM
         off = 1e3 * _beyond(self.sensors.displacements(), expected)
         what = "where the journal left it" if begun else "it"

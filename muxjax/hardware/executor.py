@@ -54,7 +54,8 @@ class Run:
         completed: Every instruction was done and the board disarmed.
         reason: "completed", or what stopped it.
         duration_s: While armed, on the board's clock [s]; NaN if it never armed.
-        measured: Displacements by the wheel encoders at the end [m]; NaN for a wheel never heard.
+        measured: Displacements by the wheel encoders at the end [m]; NaN if no session got so far as
+            to find the wheels where the journal has them.
         records: The instructions that were completed in this run.
         trajectory: True displacements over time since arming, where the link knows them.
         resumable: Whether ``resume`` can go on with the journal, after a power-up if the board
@@ -83,7 +84,7 @@ class Progress:
         instruction: Under way, from 1; one more than ``instructions`` when all are done.
         instructions: How many there are.
         phase: In words.
-        measured: Displacements by the wheel encoders [m]; NaN for a wheel never heard.
+        measured: Displacements by the wheel encoders [m]; NaN before the preflight.
         checks: The preflight report, once it is made.
     """
 
@@ -413,6 +414,8 @@ class Executor(Transaction):
                 if status & (STALLED | OFFLINE)
             ]
             failure.servo = said.part if said is not None and said.part else (*flags, 0)[0]
+            if failure.servo and f"({failure.servo})" not in str(failure):
+                failure.args = (f"{failure} ({failure.servo})",)
         if failure.servo:
             self._note(ServoEntry(servo=failure.servo, reason=str(failure)))
         return failure

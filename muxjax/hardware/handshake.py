@@ -69,6 +69,7 @@ class Handshake(Session):
         self.phase = ""
         self._armed_board_s = math.nan
         self._lengths: Lengths = (None,) * robot.n_tendons  # last ones heard
+        self._lengths_agree = False  # with the journal, in this session
 
     # The journal
 
@@ -79,7 +80,13 @@ class Handshake(Session):
             raise Failed(f"journal: {error}", After.RESUME) from error
 
     def _heard_lengths(self) -> Lengths:
-        """Displacements [m], of each wheel the last one heard in any session of this run."""
+        """Displacements [m], of each wheel the last one heard in any session of this run.
+
+        Not of a session that has not yet compared them with the journal: a board that lost its
+        turn counts says nonsense until then, and an arm that was moved must stay refused.
+        """
+        if not self._lengths_agree:
+            return self._lengths
         heard = self.sensors.displacements().tolist()
         known = zip(heard, self._lengths, strict=True)
         self._lengths = tuple(old if math.isnan(new) else new for new, old in known)
@@ -91,11 +98,13 @@ class Handshake(Session):
         """Greet, learn where everything is, check it, arm."""
         self.phase = "handshake"
         self._armed_at, self.sensors, self.checks = None, Sensors(self.robot), ()
+        self._lengths_agree = False
         yield from self._greet()
         expected = self.journal.standing
         yield from self._learn_turns(expected)
         self.phase = "preflight"
         self.checks = self._preflight(expected)
+        self._lengths_agree = self._lengths_check(expected).passed
         for check in self.checks:
             if not check.passed:
                 self._refuse(check, expected)

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from muxjax.hardware.handshake import Handshake
 from muxjax.hardware.journal import LegEntry
 from muxjax.hardware.protocol import SERVO_BITS_PER_RAD, SERVO_LIMIT_BITS, Op, Reason
-from muxjax.hardware.session import After, Failed, Script
+from muxjax.hardware.session import SENSOR_WAIT_S, After, Failed, Script
 from muxjax.hardware.visits import Visit, make_visit
 
 Targets = Mapping[int, int]  # {servo: 0.1 degree}
@@ -54,7 +54,11 @@ class Transaction(Handshake):
         self.phase = f"axial motor to position {visit.axial}"
         yield from self._expect(lambda: self.sensors.clutches_out, "all clutches to be out")
         takes_s = float(self.robot.switch_time)
-        yield from self._command(Op.AXIAL, arg=visit.axial, takes_s=takes_s)
+        reason = yield from self._command(
+            Op.AXIAL, arg=visit.axial, takes_s=takes_s, may=(Reason.NOT_RELEASED,)
+        )
+        if reason is Reason.NOT_RELEASED:
+            yield from self._blame_held_clutches("AXIAL")
         yield from self._expect(
             lambda: self.sensors.slot == visit.axial, f"axial position {visit.axial}"
         )
@@ -140,8 +144,28 @@ class Transaction(Handshake):
 
     def _release(self, visit: Visit) -> Script[None]:
         self.phase = f"clutches {sorted(visit.tendons.values())} out"
-        yield from self._command(Op.RELEASE, visit.layer, visit.clutch_mask, takes_s=CLUTCH_S)
+        reason = yield from self._command(
+            Op.RELEASE,
+            visit.layer,
+            visit.clutch_mask,
+            takes_s=CLUTCH_S,
+            may=(Reason.NOT_RELEASED,),
+        )
+        if reason is Reason.NOT_RELEASED:
+            yield from self._blame_held_clutches("RELEASE")
         yield from self._expect(lambda: self.sensors.clutches_out, "the clutches to be out")
+
+    def _blame_held_clutches(self, op: str) -> Script[None]:
+        """Name the clutches whose wheels still follow. Always fails."""
+        yield from self._until(lambda: self.sensors.clutches[2] != 0, SENSOR_WAIT_S)
+        layer, _, held = self.sensors.clutches
+        first = (layer - 1) * self.robot.tendons_per_segment + 1
+        tendons = [first + k for k in range(self.robot.tendons_per_segment) if held >> k & 1]
+        raise Failed(
+            f"{op} aborted by the board: NOT_RELEASED, clutches {tendons} are still in",
+            After.REPAIR,
+            reason=Reason.NOT_RELEASED,
+        )
 
     def _move_all(self, number: int, visit: Visit, first_leg: int) -> Script[int]:
         """Every leg, then trims until the wheels stand right; how many trims."""

@@ -142,7 +142,9 @@ def test_an_arm_that_was_moved_by_hand_is_refused(muxarm):
     pass_time(link, 1.0)
     link.board.mechanics._wind(8, 0.003)
     for _ in range(2):  # trying again must not make it true
-        with pytest.raises(ValueError, match=r"lengths: tendon 9 stands 3.* from where the journal"):
+        with pytest.raises(
+            ValueError, match=r"lengths: tendon 9 stands 3.* from where the journal"
+        ):
             resume(journal, link)
 
 

@@ -54,8 +54,8 @@ class Run:
         completed: Every instruction was done and the board disarmed.
         reason: "completed", or what stopped it.
         duration_s: While armed, on the board's clock [s]; NaN if it never armed.
-        measured: Displacements by the wheel encoders at the end [m]; NaN if no session got so far as
-            to find the wheels where the journal has them.
+        measured: Displacements by the wheel encoders at the end [m]; NaN if no session came so far
+            that it found the wheels where the journal has them.
         records: The instructions that were completed in this run.
         trajectory: True displacements over time since arming, where the link knows them.
         resumable: Whether ``resume`` can go on with the journal, after a power-up if the board

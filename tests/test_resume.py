@@ -168,9 +168,12 @@ def test_a_board_that_lost_its_turns_does_not_spoil_the_journal(muxarm):
 
 def test_an_unfinished_journal_takes_no_other_program(muxarm):
     made = program(muxarm, [visit(muxarm, 1, [{1: 0.02}])])
-    journal = begun(muxarm, made)
+    link, journal = LockstepLink(muxarm), begun(muxarm, made)
+    run_until(link, journal, 6.0)
     with pytest.raises(ValueError, match="journal: holds a program that is not finished"):
-        execute(made, LockstepLink(muxarm), journal=journal)
+        execute(made, link, journal=journal)
+    never_armed = begun(muxarm, program(muxarm, [visit(muxarm, 2, [{1: 0.02}])]))
+    assert execute(made, LockstepLink(muxarm), journal=never_armed).completed
     with pytest.raises(ValueError, match="journal: holds no program"):
         resume(MemoryJournal(), LockstepLink(muxarm))
 

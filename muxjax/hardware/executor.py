@@ -116,13 +116,13 @@ def execute(
         on_progress: Is told of every new phase, and about once a second.
 
     Raises:
-        ValueError: The program is wrong or for another robot, the journal holds one that is not
-            finished, the board is another one, or the tendons do not stand at the program's
+        ValueError: The program is wrong or for another robot, the journal holds one that was begun
+            and is not finished, the board is another one, or the tendons do not stand at the program's
             start. Nothing has moved then.
     """
     journal = MemoryJournal() if journal is None else journal
     before = journal.standing
-    if before.program is not None and not before.completed and not before.failed_servos:
+    if before.begun and not before.completed and not before.failed_servos:
         raise ValueError(
             "journal: holds a program that is not finished; go on with it by resume, or begin "
             "another journal"

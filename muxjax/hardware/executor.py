@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Float
 
 from muxjax.hardware.codec import layouts
-from muxjax.hardware.handshake import OFFLINE, STALLED, Check
+from muxjax.hardware.handshake import Check
 from muxjax.hardware.journal import (
     AtEntry,
     DoneEntry,
@@ -26,7 +26,15 @@ from muxjax.hardware.journal import (
 )
 from muxjax.hardware.links import Link, Trajectory
 from muxjax.hardware.pauses import no_long_pauses
-from muxjax.hardware.protocol import BoardState, Frame, Op, Reason, check_robot_fits
+from muxjax.hardware.protocol import (
+    OFFLINE,
+    STALLED,
+    BoardState,
+    Frame,
+    Op,
+    Reason,
+    check_robot_fits,
+)
 from muxjax.hardware.session import AFTER, After, Failed, Script, Wrong
 from muxjax.hardware.transaction import CLUTCH_S, InstructionRecord, Transaction
 from muxjax.hardware.visits import Visit, load_visits, make_visit
@@ -117,8 +125,8 @@ def execute(
 
     Raises:
         ValueError: The program is wrong or for another robot, the journal holds one that was begun
-            and is not finished, the board is another one, or the tendons do not stand at the program's
-            start. Nothing has moved then.
+            and is not finished, the board is another one, or the tendons do not stand at its start.
+            Nothing has moved then.
     """
     journal = MemoryJournal() if journal is None else journal
     before = journal.standing

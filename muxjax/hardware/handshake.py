@@ -10,7 +10,16 @@ import numpy as np
 from jaxtyping import Float
 
 from muxjax.hardware.journal import Entry, Lengths, MemoryJournal, SessionEntry, Standing
-from muxjax.hardware.protocol import COUNTS_PER_TURN, VERSION, Fault, Op, Reason, fingerprint_words
+from muxjax.hardware.protocol import (
+    COUNTS_PER_TURN,
+    OFFLINE,
+    STALLED,
+    VERSION,
+    Fault,
+    Op,
+    Reason,
+    fingerprint_words,
+)
 from muxjax.hardware.sensors import Sensors
 from muxjax.hardware.session import After, Failed, Script, Session, Wrong
 from muxjax.robot import Robot
@@ -22,8 +31,7 @@ TAKEOVER_S = 1.0  # by then a board is up, and its watchdog has let go of a host
 READING_TRIES = 12
 READING_S = 0.1  # for one frame of every stream, right after it began anew
 MIN_VOLTAGE_V = 18.0  # below this a 24 V servo has not its torque
-MAX_COIL_C = 100.0
-STALLED, OFFLINE = 4, 8  # bits of SERVO_FB.Status
+MAX_COIL_C = 80.0  # the shipped boards arm nobody above it
 
 
 @dataclass(frozen=True)

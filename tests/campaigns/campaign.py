@@ -27,7 +27,6 @@ SLIPS = 1.2  # of the physics' slip at a clutch, at most
 ENCODER_M = 5e-5  # noise, rounding and what is left of the encoders' errors
 BOOT_S = 2.0
 COOLING_S = 300.0
-TO_WAIT_FOR = ("coils", "supply")  # refusals that pass
 
 
 class HostKilled(Exception):  # noqa: N818 - no error, an event
@@ -132,11 +131,8 @@ def _host(
             continue
         except ValueError as refused:
             verdict.steps.append(f"{link.now:.2f} s: refused: {refused}")
-            verdict.reason, last = str(refused), None
-            if not str(refused).startswith(TO_WAIT_FOR):
-                return None
-            _operator(link)
-            continue
+            verdict.reason = str(refused)
+            return None
         verdict.steps.append(f"{link.now:.2f} s: {last.reason}; failed {last.failed_servos}")
         verdict.reason = last.reason
         if last.completed or (not last.resumable and scenario.explains(last.reason)):

@@ -228,6 +228,21 @@ def lost_turns(bench: Bench) -> None:
     bench.refuses(Op.TURNS, 0, 1 << 16 | 0xFFFF, Reason.TURNS_UNKNOWN)
 
 
+def lost_turns_beyond_the_range(bench: Bench) -> None:
+    """A clutch slipped at the range's end: so far the turn is believed, and no further."""
+    board = bench.link.board
+    for beyond, taken in ((0.0015, True), (0.0025, False)):
+        board.mechanics.wheels[0] = board.limits[0, 1] + beyond
+        board.mechanics.windings += 1
+        board.power_cycle()
+        bench.wait(1.0)
+        bench.do(Op.HELLO, arg=VERSION << 16 | bench.session)
+        if taken:
+            bench.do(Op.TURNS, 0, 1 << 16)
+        else:
+            bench.refuses(Op.TURNS, 0, 1 << 16, Reason.TENDON_RANGE)
+
+
 def numbers(bench: Bench) -> None:
     bench.arm()
     last = bench.seq
@@ -312,6 +327,7 @@ RULES: tuple[Callable[[Bench], None], ...] = (
     plug_that_stays_in,
     plug_that_stays_in_unseen,
     lost_turns,
+    lost_turns_beyond_the_range,
     numbers,
     many_answers_are_remembered,
     new_session_new_numbers,
@@ -416,6 +432,8 @@ def mutants() -> list[Mutant]:
     checks = [without_check(op, c) for op, found in interlocks.CHECKS.items() for c in found]
     limits = [
         limit(interlocks, "SERVO_LIMIT_BITS", protocol.SERVO_LIMIT_BITS + 1),
+        limit(interlocks, "TURNS_SLACK_M", 0.0),
+        limit(interlocks, "TURNS_SLACK_M", 2 * interlocks.TURNS_SLACK_M),
         limit(interlocks, "MAX_DIVIDER", protocol.MAX_DIVIDER + 1),
         limit(virtual_board, "WATCHDOG_S", 1.4 * protocol.WATCHDOG_S),
         limit(virtual_board, "WATCHDOG_S", 0.8 * protocol.WATCHDOG_S),

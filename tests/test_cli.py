@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from muxjax.cli import main
+from muxjax.cli import main, runs
 from muxjax.cli.plans import Method
 from muxjax.hardware import Journal
 from muxjax.planning import METHODS
@@ -241,15 +241,34 @@ def test_a_dry_run_opens_no_bus_and_leaves_journal_and_log(muxjax, tmp_path):
         assert kept.standing.completed
 
 
+def test_new_plans_are_made_as_the_command_line_says(muxjax, tmp_path, monkeypatch):
+    path = str(tmp_path / "program.json")
+    muxjax("plan", "--q-deg", "10", "0", "5", "90", "3", "180", "--out", path)
+    asked, carry_out = {}, runs.run_to_target
+
+    def run_to_target(*args, **fields):
+        asked.update(fields)
+        return carry_out(*args, **fields)
+
+    monkeypatch.setattr(runs, "run_to_target", run_to_target)
+    options = ("--world", "cabinet", "--max-step-mm", "5", "--preset", "fastest")
+    code, _, _ = muxjax("run", path, *options, "--json")
+    assert code == 0
+    assert asked["world"].name == "cabinet"
+    assert (asked["max_step"], asked["preset"]) == (0.005, "fastest")
+    assert "servos" not in asked
+
+
 def test_a_bus_that_cannot_be_opened_comes_after_the_rehearsal(muxjax, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     path = str(tmp_path / "program.json")
     muxjax("plan", "--q-deg", "10", "0", "5", "90", "3", "180", "--out", path)
     code, out, err = muxjax("run", path, "--bus", '{"interface": "none such"}')
     assert code == 2
-    assert "rehearsed on the virtual board" in out
-    assert "cannot be opened" in err
-    assert len(err.strip().splitlines()) == 1
+    assert out == ""
+    rehearsed, refused = err.strip().splitlines()
+    assert "rehearsed on the virtual board" in rehearsed
+    assert "cannot be opened" in refused
     code, out, _ = muxjax("run", path, "--bus", '{"interface": "none such"}', "--no-rehearse")
     assert (code, out) == (2, "")
 
@@ -271,6 +290,11 @@ def test_a_bus_that_cannot_be_opened_comes_after_the_rehearsal(muxjax, tmp_path,
         (["run", "nothing.json"], "nothing.json: cannot be read"),
         (["resume", "nothing.journal", "--bus", "{}"], "nothing.journal: no such journal"),
         (["board", "--physics", "nothing"], "no 'nothing' among the shipped files"),
+        (["board", "--port", "99999"], "port: 99999 on 127.0.0.1 cannot be served"),
+        (["conformance", "--mapping", "m.yaml"], "--mapping is of the board on --bus"),
+        (["conformance", "--bus", "nothing"], "no such section in python-can's configuration"),
+        (["run", "nothing.json", "--mapping", "m.yaml"], "--mapping is of the board on --bus"),
+        (["run", "nothing.json", "--world", "nothing"], "no 'nothing' among the shipped files"),
         (["demo", "--task", "nothing"], "no 'nothing' among the shipped files"),
     ],
 )

@@ -326,10 +326,24 @@ def test_gear_that_falls_short_is_trimmed_by_the_wheel(muxarm):
     assert link.board.mechanics.displacements == pytest.approx(np.array(made.target), abs=END_M)
 
 
+def test_the_garbage_collector_leaves_a_run_alone(muxarm):
+    import gc
+
+    frozen = []
+    run = execute(
+        program(muxarm, [visit(muxarm, 1, [{1: 0.001}])]),
+        LockstepLink(muxarm),
+        on_progress=lambda _: frozen.append(gc.get_freeze_count()),
+    )
+    assert run.completed
+    assert min(frozen) > 1000
+    assert gc.get_freeze_count() == 0
+
+
 @pytest.mark.parametrize(
     ("share", "move", "reason"),
     [
-        (0.55, 0.001, "counts off after 3 trims"),
+        (0.55, 0.001, "counts off after 3 trims: gear, clutch or encoder"),
         (0.6, 0.02, r"wheel moved 12.00 mm while servo 1 turned for 20.00 mm"),
     ],
 )

@@ -79,6 +79,23 @@ def test_a_new_program_replaces_the_old_one_but_not_its_failed_servos():
         journal.write(entry)
     now = journal.standing
     assert (now.done, now.completed, now.failed_servos) == (0, False, (2,))
+    assert not now.begun  # it begins where the old one ended, not where an accident left the arm
+
+
+@pytest.mark.parametrize(
+    ("entries", "begun"),
+    [
+        (ENTRIES[:1], False),
+        (ENTRIES[:2], True),
+        (ENTRIES, True),
+        ([*ENTRIES[:4], ENTRIES[0]], True),
+    ],
+)
+def test_begun_from_the_first_session_to_the_next_program_after_the_end(entries, begun):
+    journal = MemoryJournal()
+    for entry in entries:
+        journal.write(entry)
+    assert journal.standing.begun is begun
 
 
 def test_a_torn_last_line_is_dropped_and_reported_wherever_it_tore(path):

@@ -210,6 +210,13 @@ def test_a_corrupt_slcan_line_is_a_lost_frame(line, muxarm):
 
 def test_a_bus_that_cannot_be_opened_is_named():
     pytest.importorskip("can")
-    for spec in ("{", '{"interface": "no such"}', '{"interface": "virtual", "channel": 1, "x"}'):
-        with pytest.raises(ValueError, match="cannot be opened"), open_bus(spec):
+    wrong = (
+        "{",
+        "no such section",
+        '{"interface": "no such"}',
+        '{"interface": "socketcan", "channel": "can99"}',
+        '{"interface": "virtual", "channel": 1, "x"}',
+    )
+    for spec in wrong:
+        with pytest.raises(ValueError, match=r"^bus: .* cannot be opened"), open_bus(spec):
             pass

@@ -70,7 +70,11 @@ def main(arguments: Sequence[str] | None = None) -> None:
         # The reader has seen enough; Python must not complain about it at exit either.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         code = 0
-    except (ValueError, PlanningError, OSError) as error:
+    except OSError as error:
+        text = error if error.filename is None else f"{error.filename}: {error.strerror}"
+        print(f"muxjax: {text}", file=sys.stderr)
+        code = 2
+    except (ValueError, PlanningError) as error:
         print(f"muxjax: {error}", file=sys.stderr)
         code = 2
     except KeyboardInterrupt:

@@ -16,6 +16,8 @@ from muxjax.hardware import VirtualBoard
 from muxjax.hardware.serving import LOOPBACK, SlcanWire, SocketcandWire, serve
 from muxjax.program_file import load_program
 from muxjax.robot import Robot, load_robot
+from muxjax.scheduler import check_same_robot
+from muxjax.tendons import check_displacements
 
 KEEP_S = 0.05  # between two writings of the arm's true lengths
 
@@ -45,14 +47,17 @@ def board(
         seed: Of everything that is drawn.
     """
     mechanism = load_robot(robot)
-    start = None if program is None else load_program(program).start
+    start = None if program is None else _start(mechanism, program)
     found = None if arm is None else _kept(mechanism, arm)
     virtual = VirtualBoard(mechanism, physics, start if found is None else found, seed=seed)
     if found is not None:
         virtual.power_cycle(off_s=0.0)
     wire: SocketcandWire | SlcanWire
     if serve == "socketcand":
-        wire = SocketcandWire(port)
+        try:
+            wire = SocketcandWire(port)
+        except (OSError, OverflowError) as error:  # in use, not allowed, no port at all
+            raise ValueError(f"port: {port} on {LOOPBACK} cannot be served: {error}") from error
         bus: dict[str, Any] = {"interface": "socketcand", "host": LOOPBACK, "port": wire.port}
         bus |= {"channel": "can0", "tcp_tune": True}
     else:
@@ -64,6 +69,12 @@ def board(
     finally:
         wire.close()
     return 0
+
+
+def _start(mechanism: Robot, path: Path) -> tuple[float, ...]:
+    program = load_program(path)
+    check_same_robot(mechanism, program)
+    return program.start
 
 
 def _serve(virtual: VirtualBoard, wire: SocketcandWire | SlcanWire, arm: Path | None) -> None:
@@ -102,8 +113,10 @@ def _kept(robot: Robot, arm: Path) -> np.ndarray | None:
         document = json.loads(arm.read_text(encoding="utf-8"))
         whose = document["schema"], document["robot"]
         lengths = np.array(document["displacements_m"], dtype=np.float64)
-    except (ValueError, KeyError, TypeError) as error:
+    except KeyError as missing:
+        raise ConfigError(f"{arm}: not an arm's lengths: {missing} is missing") from missing
+    except (ValueError, TypeError) as error:
         raise ConfigError(f"{arm}: not an arm's lengths: {error}") from error
     if whose != ("muxjax/arm/1", robot.fingerprint):
         raise ConfigError(f"{arm}: not the lengths of this robot ({robot.fingerprint})")
-    return lengths
+    return np.asarray(check_displacements(robot, f"{arm}: displacements_m", lengths))

@@ -65,9 +65,12 @@ def conformance(
         mapping: YAML file of a lab's own DBC that the board on --bus speaks.
         json: Print the findings as JSON.
     """
+    if mapping is not None and bus is None:
+        raise ValueError("conformance: --mapping is of the board on --bus")
     arm = load_robot(robot)
+    translation = None if mapping is None else Translation(mapping)
     on_finding = None if json else _print_finding
-    with _open(bus, arm, mapping) as link:
+    with _open(bus, arm, translation) as link:
         findings = run_checks(
             link,
             allow_motion=allow_motion,
@@ -92,11 +95,11 @@ def _print_finding(finding: Finding) -> None:
 
 
 @contextlib.contextmanager
-def _open(bus: str | None, arm: Robot, mapping: Path | None) -> Iterator[Link]:
+def _open(bus: str | None, arm: Robot, translation: Translation | None) -> Iterator[Link]:
     """The link that --bus asks for."""
     if bus is None:
         yield LockstepLink(arm)
         return
     with open_bus(bus) as opened:
         link = BusLink(opened, arm)
-        yield link if mapping is None else MappedLink(link, Translation(mapping))
+        yield link if translation is None else MappedLink(link, translation)

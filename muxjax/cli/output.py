@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import sys
 from typing import Any
 
 import numpy as np
@@ -14,6 +15,11 @@ from scipy.spatial.transform import Rotation
 console = Console(markup=False, highlight=False)
 if not console.is_terminal:
     console.width = 120  # a file or a pipe has no width; the default of 80 would break the tables
+
+
+def notice(text: str) -> None:
+    """Say something that is not the result: standard output may be JSON for a machine."""
+    print(text, file=sys.stderr, flush=True)
 
 
 def print_json(document: Any) -> None:

@@ -12,6 +12,7 @@ from rich.table import Table
 
 from muxjax.cli.output import console, print_json, row_of
 from muxjax.cli.poses import Quaternion, Xyz, pose_argument
+from muxjax.collision import load_world
 from muxjax.config import TaskConfig, load_yaml, resolve
 from muxjax.kinematics import check_configuration
 from muxjax.metrics import evaluate
@@ -39,6 +40,7 @@ def plan(
     method: Method = "exact",
     preset: str = "paper",
     max_step_mm: float | None = None,
+    world: str | None = None,
     robot: str = "muxarm",
     out: Path | None = None,
     save_plan: Path | None = None,
@@ -60,13 +62,14 @@ def plan(
         method: Planner.
         preset: Weights of the cost: paper, fastest, no-overshoot, or a YAML file.
         max_step_mm: Greatest tendon displacement in one step [mm]; no limit by default.
+        world: Shipped world or path of a YAML file, of which every step must be clear.
         robot: Shipped robot or path of a YAML file.
         out: Write the program here, for muxjax run.
         save_plan: Write the plan itself here, step by step, as JSON.
         json: Print JSON in SI units.
     """
     arm = load_robot(robot)
-    fields = problem_fields(arm, servos, preset, max_step_mm)
+    fields = problem_fields(arm, servos, preset, max_step_mm, world)
     if [xyz_mm, q_deg, poses].count(None) != 2:
         raise ValueError("plan: give either --xyz-mm (a pose), --q-deg or --poses")
     if xyz_mm is None and (rpy_deg is not None or quat is not None):
@@ -97,13 +100,18 @@ def plan_to_configuration(
 
 
 def problem_fields(
-    arm: Robot, servos: tuple[int, ...] | None, preset: str, max_step_mm: float | None
+    arm: Robot,
+    servos: tuple[int, ...] | None,
+    preset: str,
+    max_step_mm: float | None,
+    world: str | None = None,
 ) -> dict[str, Any]:
     """Fields of ``Problem`` that the command line chooses."""
     return {
         "servos": servos or tuple(range(1, arm.tendons_per_segment + 1)),
         "preset": preset,
         "max_step": None if max_step_mm is None else max_step_mm / 1e3,
+        "world": None if world is None else load_world(world),
     }
 
 

@@ -14,7 +14,7 @@ import numpy as np
 import tyro
 from rich.table import Table
 
-from muxjax.cli.output import console, print_json
+from muxjax.cli.output import console, notice, print_json
 from muxjax.cli.plans import Method, plan_to_configuration, problem_fields
 from muxjax.cli.poses import Quaternion, Xyz, pose_argument
 from muxjax.cli.progress import Reporter
@@ -38,6 +38,7 @@ def run(
     planner: Method = "exact",
     preset: str = "paper",
     max_step_mm: float | None = None,
+    world: str | None = None,
     robot: str = "muxarm",
     bus: str | None = None,
     dry_run: bool = False,
@@ -68,8 +69,9 @@ def run(
         q_deg: Bending angle and azimuth of each segment [degrees], instead of a pose.
         servos: Available servos, for the plan; all by default.
         planner: Method of the plan, and of new ones.
-        preset: Weights of its cost: paper, fastest, no-overshoot, or a YAML file.
-        max_step_mm: Greatest tendon displacement in one of its steps [mm]; no limit by default.
+        preset: Weights of their cost: paper, fastest, no-overshoot, or a YAML file.
+        max_step_mm: Greatest tendon displacement in one of their steps [mm]; no limit by default.
+        world: Shipped world or path of a YAML file, of which every step they make must be clear.
         robot: Shipped robot or path of a YAML file; a program runs only on its own robot.
         bus: Arguments of can.Bus as a JSON object, or a section of python-can's configuration;
             the virtual board, in lockstep, by default.
@@ -86,11 +88,13 @@ def run(
         raise ValueError("run: give either a program file, --xyz-mm (a pose) or --q-deg")
     if xyz_mm is None and (rpy_deg is not None or quat is not None):
         raise ValueError("run: only --xyz-mm takes --rpy-deg or --quat")
+    if mapping is not None and bus is None:
+        raise ValueError("run: --mapping is of the board on --bus")
     arm = load_robot(robot)
+    fields = problem_fields(arm, servos, preset, max_step_mm, world)
     if program is not None:
         loaded = load_program(program)
     else:
-        fields = problem_fields(arm, servos, preset, max_step_mm)
         if xyz_mm is None:
             found = plan_to_configuration(arm, q_deg, planner, fields)
         else:
@@ -98,15 +102,15 @@ def run(
             found = plan_to_pose(arm, pose, method=planner, **fields).plan
         loaded = schedule(arm, found)
     check_same_robot(arm, loaded)
+    translation = None if mapping is None else Translation(mapping)
     real = bus is not None and not dry_run
+    del fields["servos"]  # new plans have those that are left
 
     def go(link: Link, into: MemoryJournal, tell: Callable[[Progress], None] | None) -> Run:
-        return run_to_target(link, into, loaded, method=planner, on_progress=tell)
+        return run_to_target(link, into, loaded, method=planner, on_progress=tell, **fields)
 
     if not real or rehearse:
-        virtual = LockstepLink(
-            arm, physics, loaded.start, loaded.axial, 1 if not real else stream_divider
-        )
+        virtual = LockstepLink(arm, physics, loaded.start, loaded.axial, stream_divider)
         if not real:
             with _journal(journal) as into, Reporter() as tell:
                 done = go_logged(virtual, log, 0.0, lambda link: go(link, into, tell))
@@ -114,12 +118,12 @@ def run(
         done = go(virtual, MemoryJournal(), None)
         if not done.completed:
             raise ValueError(f"run: the rehearsal on the virtual board failed: {done.reason}")
-        console.print(f"rehearsed on the virtual board: {done.duration_s:.2f} s")
+        notice(f"rehearsed on the virtual board: {done.duration_s:.2f} s")
     assert bus is not None  # else not real
     path = journal or Path("run.journal")
     with Journal.open(path) as into:
         done = on_bus(
-            bus, arm, stream_divider, mapping, log, lambda link, tell: go(link, into, tell)
+            bus, arm, stream_divider, translation, log, lambda link, tell: go(link, into, tell)
         )
     return report(done, loaded, json, path)
 
@@ -129,6 +133,9 @@ def resume(
     bus: str,
     robot: str = "muxarm",
     planner: Method = "exact",
+    preset: str = "paper",
+    max_step_mm: float | None = None,
+    world: str | None = None,
     log: Path | None = None,
     stream_divider: int = 1,
     mapping: Path | None = None,
@@ -145,6 +152,9 @@ def resume(
         bus: As for muxjax run.
         robot: Shipped robot or path of a YAML file.
         planner: Method of new plans.
+        preset: Weights of their cost: paper, fastest, no-overshoot, or a YAML file.
+        max_step_mm: Greatest tendon displacement in one of their steps [mm]; no limit by default.
+        world: Shipped world or path of a YAML file, of which every step of theirs must be clear.
         log: File for every frame, as candump -L writes it; it grows if it exists.
         stream_divider: Feedback at 1 / this of its rates, for slow serial links.
         mapping: YAML file of a lab's own DBC that the board on --bus speaks.
@@ -153,16 +163,21 @@ def resume(
     arm = load_robot(robot)
     if not journal.is_file():
         raise ValueError(f"{journal}: no such journal")
+    translation = None if mapping is None else Translation(mapping)
+    fields = problem_fields(arm, None, preset, max_step_mm, world)
+    del fields["servos"]  # new plans have those that are left
     with Journal.open(journal) as into:
         if into.note:
-            console.print(into.note)
+            notice(into.note)
         done = on_bus(
             bus,
             arm,
             stream_divider,
-            mapping,
+            translation,
             log,
-            lambda link, tell: run_to_target(link, into, method=planner, on_progress=tell),
+            lambda link, tell: run_to_target(
+                link, into, method=planner, on_progress=tell, **fields
+            ),
         )
         program = into.standing.program
     assert program is not None  # else run_to_target has raised
@@ -177,7 +192,7 @@ def on_bus(
     bus: str,
     arm: Robot,
     stream_divider: int,
-    mapping: Path | None,
+    translation: Translation | None,
     log: Path | None,
     go: Callable[[Link, Reporter], Run],
 ) -> Run:
@@ -186,10 +201,10 @@ def on_bus(
     with open_bus(bus) as opened, Reporter() as tell:
         link = BusLink(opened, arm, stream_divider)
         begin_s = time.time() - link.now
-        ours = link if mapping is None else MappedLink(link, Translation(mapping))
+        ours = link if translation is None else MappedLink(link, translation)
         done = go_logged(ours, log, begin_s, lambda logged: go(logged, tell))
     for kind, count in link.errors.items():
-        console.print(f"bus: raised {kind} {count} times")
+        notice(f"bus: raised {kind} {count} times")
     return done
 
 

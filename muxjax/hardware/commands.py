@@ -149,23 +149,22 @@ def _probe(
     wheels, servos = board.senses.wheel_counts(), board.senses.servo_bits()
     centre = board.limits.mean(axis=1) - board.senses.displacements()
     by = {s: angle if centre[c] > 0 else -angle for c, s in tendons.items()}
-    yield from _turn(board, by, half)
+    board.mechanics.turn(by, half)
+    yield from _turned(board)
     turned = np.abs(board.senses.servo_bits() - servos)
     for servo in sorted(by):
         if must_turn and turned[servo] < FOLLOW * angle * SERVO_BITS_PER_RAD:
             offline = servo in board.senses.offline
             raise Trip(Reason.SERVO_OFFLINE if offline else Reason.SERVO_STALLED, servo + 1)
     moved = np.abs(board.senses.wheel_counts() - wheels)
-    yield from _turn(board, {s: -a for s, a in by.items()}, half)
+    board.mechanics.turn({s: -a for s, a in by.items()}, half)
+    yield from _turned(board)
     expected = angle / float(board.robot.gear_ratio) * COUNTS_PER_RAD
     return {c for c in tendons if moved[c] > FOLLOW * expected}
 
 
-def _turn(
-    board: VirtualBoard, by: Mapping[int, float], duration: float
-) -> Generator[float, None, None]:
-    """Turn servos {servo: rad} and wait until the UART has heard that they are there."""
-    board.mechanics.turn(by, duration)
+def _turned(board: VirtualBoard) -> Generator[float, None, None]:
+    """Wait until servos that turn should be there, and the UART has heard it."""
     yield board.mechanics.end
     if (told := board.mechanics.next_told()) > board.now:
         yield told
@@ -182,11 +181,12 @@ def start(board: VirtualBoard, idx: int, arg: int) -> Job:
 
 
 def _move(board: VirtualBoard, targets: Mapping[int, float]) -> Job:
-    by = {s: board.mechanics.way_to(s, target) for s, target in targets.items()}
-    duration = move_time(board.robot, board.physics, max(abs(angle) for angle in by.values()))
-    if duration > 0:
+    sensed = board.senses.servo_bits() / SERVO_BITS_PER_RAD
+    way = max(abs(target - float(sensed[s])) for s, target in targets.items())
+    if (duration := move_time(board.robot, board.physics, way)) > 0:
         board.guards.begin_move(board)
-        yield from _turn(board, by, duration)
+        board.mechanics.turn_to(targets, duration)
+        yield from _turned(board)
         board.guards.end_move()
     return Reason.NONE
 

@@ -18,6 +18,7 @@ import numpy as np
 
 from muxjax.hardware.codec import database
 from muxjax.hardware.links import Link
+from muxjax.hardware.pauses import no_long_pauses
 from muxjax.hardware.protocol import (
     BOARD_BEAT_S,
     COUNTS_PER_TURN,
@@ -110,11 +111,12 @@ def run_checks(
         raise ValueError(f"only: no check {unknown[0]!r}; there are {', '.join(CHECKS)}")
     bench = Bench(link, allow_motion, just_powered, straight)
     findings = []
-    for name in (name for name in CHECKS if name in wanted):
-        finding = _make(bench, name)
-        findings.append(finding)
-        if on_finding is not None:
-            on_finding(finding)
+    with no_long_pauses():
+        for name in (name for name in CHECKS if name in wanted):
+            finding = _make(bench, name)
+            findings.append(finding)
+            if on_finding is not None:
+                on_finding(finding)
     return tuple(findings)
 
 

@@ -12,10 +12,9 @@ from jaxtyping import Float, Int
 from pydantic import Field, model_validator
 
 from muxjax.config import Strict, load_yaml
-from muxjax.hardware.protocol import COUNTS_PER_TURN, WHEEL_BITS
+from muxjax.hardware.protocol import COUNTS_PER_TURN, PARITY, WHEEL_BITS
 
 COUNTS_PER_RAD = COUNTS_PER_TURN / (2 * math.pi)
-PARITY, MAGNET = 1, 2  # status bits of WHEEL_FB
 NOISE_BLOCK = 1024
 
 

@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Float
 
 from muxjax.hardware.codec import layouts
-from muxjax.hardware.handshake import OFFLINE, STALLED, Check
+from muxjax.hardware.handshake import Check
 from muxjax.hardware.journal import (
     AtEntry,
     DoneEntry,
@@ -25,7 +25,16 @@ from muxjax.hardware.journal import (
     ServoEntry,
 )
 from muxjax.hardware.links import Link, Trajectory
-from muxjax.hardware.protocol import BoardState, Frame, Op, Reason, check_robot_fits
+from muxjax.hardware.pauses import no_long_pauses
+from muxjax.hardware.protocol import (
+    OFFLINE,
+    STALLED,
+    BoardState,
+    Frame,
+    Op,
+    Reason,
+    check_robot_fits,
+)
 from muxjax.hardware.session import AFTER, After, Failed, Script, Wrong
 from muxjax.hardware.transaction import CLUTCH_S, InstructionRecord, Transaction
 from muxjax.hardware.visits import Visit, load_visits, make_visit
@@ -53,7 +62,8 @@ class Run:
         completed: Every instruction was done and the board disarmed.
         reason: "completed", or what stopped it.
         duration_s: While armed, on the board's clock [s]; NaN if it never armed.
-        measured: Displacements by the wheel encoders at the end [m]; NaN for a wheel never heard.
+        measured: Displacements by the wheel encoders at the end [m]; NaN if no session came so far
+            that it found the wheels where the journal has them.
         records: The instructions that were completed in this run.
         trajectory: True displacements over time since arming, where the link knows them.
         resumable: Whether ``resume`` can go on with the journal, after a power-up if the board
@@ -82,7 +92,7 @@ class Progress:
         instruction: Under way, from 1; one more than ``instructions`` when all are done.
         instructions: How many there are.
         phase: In words.
-        measured: Displacements by the wheel encoders [m]; NaN for a wheel never heard.
+        measured: Displacements by the wheel encoders [m]; NaN before the preflight.
         checks: The preflight report, once it is made.
     """
 
@@ -114,13 +124,13 @@ def execute(
         on_progress: Is told of every new phase, and about once a second.
 
     Raises:
-        ValueError: The program is wrong or for another robot, the journal holds one that is not
-            finished, the board is another one, or the tendons do not stand at the program's
-            start. Nothing has moved then.
+        ValueError: The program is wrong or for another robot, the journal holds one that was begun
+            and is not finished, the board is another one, or the tendons do not stand at its start.
+            Nothing has moved then.
     """
     journal = MemoryJournal() if journal is None else journal
     before = journal.standing
-    if before.program is not None and not before.completed and not before.failed_servos:
+    if before.begun and not before.completed and not before.failed_servos:
         raise ValueError(
             "journal: holds a program that is not finished; go on with it by resume, or begin "
             "another journal"
@@ -164,16 +174,17 @@ def _drive(link: Link, journal: MemoryJournal, on_progress: OnProgress | None) -
     executor = Executor(link.robot, journal, link.new_session(), link.stream_divider)
     frames: list[Frame] = []
     told = -1
-    while not executor.finished:
-        try:
-            link.send(executor.step(link.now, frames))
-            if on_progress is not None and told != executor.news:
-                told = executor.news
-                on_progress(executor.progress())
-            frames = link.wait(executor.next_time)
-        except KeyboardInterrupt:
-            executor.estop("stopped from the keyboard")
-            frames = []
+    with no_long_pauses():
+        while not executor.finished:
+            try:
+                link.send(executor.step(link.now, frames))
+                if on_progress is not None and told != executor.news:
+                    told = executor.news
+                    on_progress(executor.progress())
+                frames = link.wait(executor.next_time)
+            except KeyboardInterrupt:
+                executor.estop("stopped from the keyboard")
+                frames = []
     return executor.result(link.trajectory)
 
 
@@ -411,6 +422,8 @@ class Executor(Transaction):
                 if status & (STALLED | OFFLINE)
             ]
             failure.servo = said.part if said is not None and said.part else (*flags, 0)[0]
+            if failure.servo and f"({failure.servo})" not in str(failure):
+                failure.args = (f"{failure} ({failure.servo})",)
         if failure.servo:
             self._note(ServoEntry(servo=failure.servo, reason=str(failure)))
         return failure

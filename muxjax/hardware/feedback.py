@@ -4,7 +4,14 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from muxjax.hardware.protocol import BOARD_BEAT_S, COUNTS_PER_TURN
+from muxjax.hardware.protocol import (
+    BOARD_BEAT_S,
+    COUNTS_PER_TURN,
+    COUPLED,
+    MOVING,
+    OFFLINE,
+    STALLED,
+)
 
 if TYPE_CHECKING:
     from muxjax.hardware.virtual_board import VirtualBoard
@@ -12,7 +19,6 @@ if TYPE_CHECKING:
 TICK_S = 0.01  # the fastest stream, WHEEL_FB; the others are whole multiples
 CURRENT_LIMIT_A = 12.75  # of the eight-bit field
 HOTTEST_C = 215  # likewise
-MOVING, COUPLED, STALLED, OFFLINE = 1, 2, 4, 8  # status bits of SERVO_FB
 
 
 def stream(board: VirtualBoard, tick: int) -> None:

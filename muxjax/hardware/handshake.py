@@ -10,7 +10,16 @@ import numpy as np
 from jaxtyping import Float
 
 from muxjax.hardware.journal import Entry, Lengths, MemoryJournal, SessionEntry, Standing
-from muxjax.hardware.protocol import COUNTS_PER_TURN, VERSION, Fault, Op, Reason, fingerprint_words
+from muxjax.hardware.protocol import (
+    COUNTS_PER_TURN,
+    OFFLINE,
+    STALLED,
+    VERSION,
+    Fault,
+    Op,
+    Reason,
+    fingerprint_words,
+)
 from muxjax.hardware.sensors import Sensors
 from muxjax.hardware.session import After, Failed, Script, Session, Wrong
 from muxjax.robot import Robot
@@ -22,8 +31,7 @@ TAKEOVER_S = 1.0  # by then a board is up, and its watchdog has let go of a host
 READING_TRIES = 12
 READING_S = 0.1  # for one frame of every stream, right after it began anew
 MIN_VOLTAGE_V = 18.0  # below this a 24 V servo has not its torque
-MAX_COIL_C = 100.0
-STALLED, OFFLINE = 4, 8  # bits of SERVO_FB.Status
+MAX_COIL_C = 80.0  # the shipped boards arm nobody above it
 
 
 @dataclass(frozen=True)
@@ -69,6 +77,7 @@ class Handshake(Session):
         self.phase = ""
         self._armed_board_s = math.nan
         self._lengths: Lengths = (None,) * robot.n_tendons  # last ones heard
+        self._lengths_agree = False  # with the journal, in this session
 
     # The journal
 
@@ -79,7 +88,13 @@ class Handshake(Session):
             raise Failed(f"journal: {error}", After.RESUME) from error
 
     def _heard_lengths(self) -> Lengths:
-        """Displacements [m], of each wheel the last one heard in any session of this run."""
+        """Displacements [m], of each wheel the last one heard in any session of this run.
+
+        Not of a session that has not yet compared them with the journal: a board that lost its
+        turn counts says nonsense until then, and an arm that was moved must stay refused.
+        """
+        if not self._lengths_agree:
+            return self._lengths
         heard = self.sensors.displacements().tolist()
         known = zip(heard, self._lengths, strict=True)
         self._lengths = tuple(old if math.isnan(new) else new for new, old in known)
@@ -91,11 +106,13 @@ class Handshake(Session):
         """Greet, learn where everything is, check it, arm."""
         self.phase = "handshake"
         self._armed_at, self.sensors, self.checks = None, Sensors(self.robot), ()
+        self._lengths_agree = False
         yield from self._greet()
         expected = self.journal.standing
         yield from self._learn_turns(expected)
         self.phase = "preflight"
         self.checks = self._preflight(expected)
+        self._lengths_agree = self._lengths_check(expected).passed
         for check in self.checks:
             if not check.passed:
                 self._refuse(check, expected)
@@ -228,7 +245,7 @@ class Handshake(Session):
 
     def _lengths_check(self, expected: Standing) -> Check:
         """Whether the arm is where the program starts, or where the journal left it."""
-        begun = any(isinstance(entry, SessionEntry) for entry in self.journal.entries)
+        begun = expected.begun
         limit = RESUME_TOLERANCE_MM if begun else START_TOLERANCE_MM
         off = 1e3 * _beyond(self.sensors.displacements(), expected)
         what = "where the journal left it" if begun else "it"

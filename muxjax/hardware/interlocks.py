@@ -24,6 +24,10 @@ from muxjax.hardware.protocol import (
 if TYPE_CHECKING:
     from muxjax.hardware.virtual_board import VirtualBoard
 
+# A tendon at its range's end may have slipped beyond it before the turns were lost; a wrong turn is
+# much further off.
+TURNS_SLACK_M = 2e-3
+
 Refused = tuple[Reason, int]
 Check = Callable[["VirtualBoard", int, int], Refused | None]
 
@@ -108,7 +112,7 @@ def coils_cool(board: VirtualBoard, idx: int, arg: int) -> Refused | None:
 
 
 def turns_fit(board: VirtualBoard, idx: int, arg: int) -> Refused | None:
-    """A wheel that exists, whose turns were lost, and a length within its range.
+    """A wheel that exists, whose turns were lost, and a length within its range or nearly so.
 
     For a wheel whose turns the board itself has counted, only its own number is taken.
     """
@@ -119,7 +123,8 @@ def turns_fit(board: VirtualBoard, idx: int, arg: int) -> Refused | None:
         return Reason.TURNS_UNKNOWN, wheel + 1
     low, high = board.limits[wheel]
     length = board.senses.length_with(wheel, whole)
-    return None if low <= length <= high else (Reason.TENDON_RANGE, wheel + 1)
+    inside = low - TURNS_SLACK_M <= length <= high + TURNS_SLACK_M
+    return None if inside else (Reason.TENDON_RANGE, wheel + 1)
 
 
 def known_axial(board: VirtualBoard, idx: int, arg: int) -> Refused | None:

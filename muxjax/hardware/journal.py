@@ -104,6 +104,8 @@ class Standing:
         toward: Goals of the motion that may have been under way, {tendon: m}.
         failed_servos: Servos not to be used again, ascending.
         completed: Whether the program ran to its end.
+        begun: Whether a session has armed the board for it, or for one before that was not
+            completed: what then slipped when clutches dropped out, no length tells.
     """
 
     program: Program | None = None
@@ -114,6 +116,7 @@ class Standing:
     toward: Mapping[int, float] | None = None
     failed_servos: tuple[int, ...] = ()
     completed: bool = False
+    begun: bool = False
 
 
 def standing(entries: Sequence[Entry]) -> Standing:
@@ -138,7 +141,28 @@ def standing(entries: Sequence[Entry]) -> Standing:
         if not isinstance(entry, (ProgramEntry, ServoEntry)):
             known = zip(entry.lengths, lengths, strict=True)
             lengths = tuple(old if new is None else new for new, old in known)
-    return Standing(first.program, first.goals, done, leg, lengths, toward, failed, completed)
+    return Standing(
+        first.program,
+        first.goals,
+        done,
+        leg,
+        lengths,
+        toward,
+        failed,
+        completed,
+        begun=_begun(entries),
+    )
+
+
+def _begun(entries: Sequence[Entry]) -> bool:
+    new = False  # whether a program has begun since
+    for entry in reversed(entries):
+        if isinstance(entry, SessionEntry):
+            return True
+        if new and isinstance(entry, EndEntry) and entry.completed:
+            return False
+        new = new or isinstance(entry, ProgramEntry)
+    return False
 
 
 class MemoryJournal:

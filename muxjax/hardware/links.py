@@ -223,9 +223,11 @@ def open_bus(spec: str) -> Iterator[can.BusABC]:
     try:
         if spec.lstrip().startswith("{"):
             bus = can.Bus(**json.loads(spec))
-        else:
+        elif can.util.load_file_config(section=spec):
             bus = can.Bus(config_context=spec)
-    except (can.CanError, TypeError, ValueError) as error:
+        else:
+            raise ValueError("no JSON object, and no such section in python-can's configuration")
+    except (can.CanError, OSError, TypeError, ValueError) as error:
         raise ValueError(f"bus: {spec} cannot be opened: {error}") from error
     try:
         yield bus

@@ -165,7 +165,7 @@ class Translation:
         self._back: dict[int, _Entry] = {}
         by_name = layouts()[0]
         for name, config in self.config.messages.items():
-            where = f"messages.{name}"
+            where = f"{path}: messages.{name}"
             if name not in by_name:
                 raise ConfigError(f"{where}: the protocol has no message {name!r}")
             entry = _Entry(where, by_name[name], _message(where, database, config.message), config)
@@ -175,10 +175,10 @@ class Translation:
         missing = sorted(by_name.keys() - self.config.messages.keys() - set(self.config.absent))
         if missing:
             raise ConfigError(
-                f"messages: our {missing[0]} is missing; map it, or list it as absent"
+                f"{path}: messages: our {missing[0]} is missing; map it, or list it as absent"
             )
         if unknown := sorted(set(self.config.absent) - by_name.keys()):
-            raise ConfigError(f"absent: the protocol has no message {unknown[0]!r}")
+            raise ConfigError(f"{path}: absent: the protocol has no message {unknown[0]!r}")
 
     def out(self, frames: Iterable[Frame]) -> list[Frame]:
         """Their frames of ours; of messages that are absent there are none."""

@@ -159,9 +159,9 @@ class Mechanics:
         self._told = set(by)
         self._begin(Motion(self.next_told(), duration, ramps, ramps), free, 0.0)
 
-    def way_to(self, servo: int, target: float) -> float:
-        """What a servo's own loop turns to reach an absolute target [rad]."""
-        return target - float(self.servo[servo])
+    def turn_to(self, targets: Mapping[int, float], duration: float) -> None:
+        """Turn servos to absolute targets {servo: rad}, which their own loops reach."""
+        self.turn({s: target - float(self.servo[s]) for s, target in targets.items()}, duration)
 
     def rotate_axial(self, slot: int, duration: float) -> None:
         """Turn the drum to a slot in ``duration`` [s]."""

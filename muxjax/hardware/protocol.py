@@ -29,6 +29,8 @@ MAX_TURNS = 127  # WHEEL_TURNS: eight bits, signed
 SERVO_LIMIT_BITS = 8_000_000  # of 2**23 in 0.1 degree: leaves room for a probe at either end
 WHEEL_BITS = 14
 COUNTS_PER_TURN = 1 << WHEEL_BITS
+MOVING, COUPLED, STALLED, OFFLINE = 1, 2, 4, 8  # status bits of SERVO_FB
+PARITY, MAGNET = 1, 2  # status bits of WHEEL_FB
 SERVO_BITS_PER_RAD = 1800 / math.pi  # 0.1 degree
 
 MAX_DIVIDER = 20  # of SET_STREAM

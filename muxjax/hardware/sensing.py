@@ -54,7 +54,7 @@ class Senses:
             return self._good
         self._sampled_at = self._mechanics.time
         counts = self._read()
-        if self.encoders.may_fail or self._bad.any():
+        if self.encoders.may_fail or self.status.any():
             self.status = self.encoders.status()
             bad = self.status != 0
             self._bad = np.where(bad, self._bad + 1, 0)

@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Protocol
 
 from muxjax.hardware.codec import layouts
 from muxjax.hardware.links import receive_frames, send_frames
+from muxjax.hardware.pauses import no_long_pauses
 from muxjax.hardware.protocol import DLC, Frame
 from muxjax.hardware.virtual_board import VirtualBoard
 
@@ -47,10 +48,11 @@ def serve(board: VirtualBoard, wire: Wire, until: Callable[[], bool]) -> None:
     """Be the board at the end of a wire, in real time, until ``until()`` says so."""
     layouts()  # reading the DBC takes a moment, for which no host should have to wait
     begin = time.monotonic()
-    while not until():
-        now = time.monotonic() - begin
-        frames = wire.receive(max(0.0, min(board.next_time - now, LOOK_S)))
-        wire.send(board.step(time.monotonic() - begin, frames))
+    with no_long_pauses():
+        while not until():
+            now = time.monotonic() - begin
+            frames = wire.receive(max(0.0, min(board.next_time - now, LOOK_S)))
+            wire.send(board.step(time.monotonic() - begin, frames))
 
 
 class BusWire:

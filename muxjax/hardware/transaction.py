@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from muxjax.hardware.handshake import Handshake
 from muxjax.hardware.journal import LegEntry
 from muxjax.hardware.protocol import SERVO_BITS_PER_RAD, SERVO_LIMIT_BITS, Op, Reason
-from muxjax.hardware.session import After, Failed, Script
+from muxjax.hardware.session import SENSOR_WAIT_S, After, Failed, Script
 from muxjax.hardware.visits import Visit, make_visit
 
 Targets = Mapping[int, int]  # {servo: 0.1 degree}
@@ -54,7 +54,11 @@ class Transaction(Handshake):
         self.phase = f"axial motor to position {visit.axial}"
         yield from self._expect(lambda: self.sensors.clutches_out, "all clutches to be out")
         takes_s = float(self.robot.switch_time)
-        yield from self._command(Op.AXIAL, arg=visit.axial, takes_s=takes_s)
+        reason = yield from self._command(
+            Op.AXIAL, arg=visit.axial, takes_s=takes_s, may=(Reason.NOT_RELEASED,)
+        )
+        if reason is Reason.NOT_RELEASED:
+            yield from self._blame_held_clutches("AXIAL")
         yield from self._expect(
             lambda: self.sensors.slot == visit.axial, f"axial position {visit.axial}"
         )
@@ -140,8 +144,28 @@ class Transaction(Handshake):
 
     def _release(self, visit: Visit) -> Script[None]:
         self.phase = f"clutches {sorted(visit.tendons.values())} out"
-        yield from self._command(Op.RELEASE, visit.layer, visit.clutch_mask, takes_s=CLUTCH_S)
+        reason = yield from self._command(
+            Op.RELEASE,
+            visit.layer,
+            visit.clutch_mask,
+            takes_s=CLUTCH_S,
+            may=(Reason.NOT_RELEASED,),
+        )
+        if reason is Reason.NOT_RELEASED:
+            yield from self._blame_held_clutches("RELEASE")
         yield from self._expect(lambda: self.sensors.clutches_out, "the clutches to be out")
+
+    def _blame_held_clutches(self, op: str) -> Script[None]:
+        """Name the clutches whose wheels still follow. Always fails."""
+        yield from self._until(lambda: self.sensors.clutches[2] != 0, SENSOR_WAIT_S)
+        layer, _, held = self.sensors.clutches
+        first = (layer - 1) * self.robot.tendons_per_segment + 1
+        tendons = [first + k for k in range(self.robot.tendons_per_segment) if held >> k & 1]
+        raise Failed(
+            f"{op} aborted by the board: NOT_RELEASED, clutches {tendons} are still in",
+            After.REPAIR,
+            reason=Reason.NOT_RELEASED,
+        )
 
     def _move_all(self, number: int, visit: Visit, first_leg: int) -> Script[int]:
         """Every leg, then trims until the wheels stand right; how many trims."""
@@ -157,13 +181,17 @@ class Transaction(Handshake):
             yield from self._move(visit, targets(goals))
         for trims in range(MAX_TRIMS + 1):
             targets = yield from self._servo_targets(visit)
-            off = self._wheel_error(visit)
+            tendon, off = self._worst_wheel(visit)
             if off <= TRIM_COUNTS:
                 return trims
             if trims < MAX_TRIMS:
                 self.phase = f"trim {trims + 1}"
                 yield from self._move(visit, targets(visit.legs[-1]))
-        raise Failed(f"a wheel is {off:.1f} counts off after {trims} trims", After.REPAIR)
+        raise Failed(
+            f"tendon {tendon}: its wheel is {off:.1f} counts off after {trims} trims: gear, clutch "
+            "or encoder",
+            After.REPAIR,
+        )
 
     def _servo_targets(self, visit: Visit) -> Script[Callable[[Mapping[int, float]], Targets]]:
         """Absolute servo angles {servo: 0.1 degree} for tendon goals {servo: m}.
@@ -187,11 +215,11 @@ class Transaction(Handshake):
 
         return targets
 
-    def _wheel_error(self, visit: Visit) -> float:
-        """Largest distance of a moved wheel from its goal [encoder counts]."""
+    def _worst_wheel(self, visit: Visit) -> tuple[int, float]:
+        """The tendon that is furthest from its goal, and how far [encoder counts]."""
         held, goals = self.sensors.displacements(), visit.legs[-1]
-        off = max(abs(held[c - 1] - goals[s]) for s, c in visit.tendons.items())
-        return float(off) / self.sensors.metres_per_count
+        off, tendon = max((abs(float(held[c - 1]) - goals[s]), c) for s, c in visit.tendons.items())
+        return tendon, off / self.sensors.metres_per_count
 
     def _move(self, visit: Visit, targets: Targets) -> Script[None]:
         """Stage every servo, start them together, see that every wheel followed its servo."""

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import TYPE_CHECKING, TypeVar
 
-from muxjax.hardware.encoders import MAGNET, PARITY
 from muxjax.hardware.faults import BROWN_OUT_S, FaultConfig, FaultKind
+from muxjax.hardware.protocol import MAGNET, PARITY
 
 if TYPE_CHECKING:
     from muxjax.hardware.virtual_board import VirtualBoard

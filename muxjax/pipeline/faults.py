@@ -16,7 +16,8 @@ from jaxtyping import Float
 from scipy.optimize import least_squares
 
 from muxjax.hardware import Link, MemoryJournal, Run, execute, resume
-from muxjax.hardware.executor import OnProgress
+from muxjax.hardware.executor import MEND_COUNTS, OnProgress
+from muxjax.hardware.protocol import COUNTS_PER_TURN
 from muxjax.kinematics import check_configuration
 from muxjax.planning import Plan, PlanningError, Problem, plan
 from muxjax.precision import host_array
@@ -29,10 +30,6 @@ from muxjax.tendons import (
     displacement_range,
 )
 
-# The executor leaves a wheel alone that is 1.5 encoder counts off; a stage for that is not worth
-# its time.
-_COUNTS_LEFT_ALONE = 2.0
-_ENCODER_COUNTS = 1 << 14  # a wheel turn, as the bus carries it
 # Displacements count this little against bending [rad/m]: it only picks one of equally bent shapes.
 _LEAST_MOTION = 1e-3
 
@@ -66,8 +63,8 @@ def replan(
         PlanningError: The planner refuses.
     """
     measured = _measured(robot, run.measured if isinstance(run, Run) else run)
-    count = 2 * math.pi * float(robot.wheel_radius) / _ENCODER_COUNTS
-    tolerance = max(fields.pop("tolerance", 0.0), _COUNTS_LEFT_ALONE * count)
+    count = 2 * math.pi * float(robot.wheel_radius) / COUNTS_PER_TURN
+    tolerance = max(fields.pop("tolerance", 0.0), MEND_COUNTS * count)
     problem = Problem(measured, target, servos=servos, axial=axial, tolerance=tolerance, **fields)
     return plan(robot, problem, method)
 

@@ -20,6 +20,7 @@ import muxjax
 from muxjax.hardware import BusLink, MemoryJournal, VirtualBoard
 from muxjax.hardware.executor import Executor, begin
 from muxjax.hardware.links import open_bus
+from muxjax.hardware.pauses import no_long_pauses
 from muxjax.hardware.protocol import BoardState
 from muxjax.hardware.serving import LOOPBACK, SlcanWire, SocketcandWire
 from muxjax.scheduler import Instruction, Program
@@ -40,11 +41,15 @@ def be_the_board(kind: str, pipe: Connection) -> None:
     pipe.send(json.dumps(bus))
     while True:
         board, begin = VirtualBoard(robot, axial=1), time.monotonic()
-        while board.state is not BoardState.ESTOPPED:
-            left = board.next_time - (time.monotonic() - begin)
-            frames = wire.receive(max(0.0, min(left, 0.01)))
-            wire.send(board.step(time.monotonic() - begin, frames))
+        with no_long_pauses():  # as ``serve`` does
+            while board.state is not BoardState.ESTOPPED:
+                left = board.next_time - (time.monotonic() - begin)
+                frames = wire.receive(max(0.0, min(left, 0.01)))
+                wire.send(board.step(time.monotonic() - begin, frames))
         pipe.send(time.monotonic())
+        pipe.recv()
+        while wire.receive(0.02):  # repetitions of the last ESTOP are not for the next board
+            pass
 
 
 def one_motion() -> Program:
@@ -65,7 +70,7 @@ def measure(kind: str, trials: int) -> np.ndarray:
     process.start()
     took = []
     try:
-        with open_bus(near.recv()) as bus:
+        with open_bus(near.recv()) as bus, no_long_pauses():  # as ``execute`` does
             link = BusLink(bus, muxjax.load_robot("muxarm"))
             for _ in range(trials):
                 journal = MemoryJournal()
@@ -83,6 +88,7 @@ def measure(kind: str, trials: int) -> np.ndarray:
                     if near.poll(0.002):
                         break
                 took.append(1e3 * (near.recv() - called))
+                near.send("another")
     finally:
         process.kill()
         process.join()

@@ -106,9 +106,13 @@ class Judge:
 
     @property
     def at_rest(self) -> bool:
-        """Whether the truth is the safe state: nothing moves, no plug is in, nobody is armed."""
+        """Whether the truth is the safe state: nothing moves, no plug is in, nobody is armed.
+
+        A plug that is stuck cannot be helped.
+        """
         mechanics = self.board.mechanics
-        still = not mechanics.moving and not mechanics.coupled and not self.board.energised
+        held = set(mechanics.coupled.values()) - mechanics.stuck_plugs
+        still = not mechanics.moving and not held and not self.board.energised
         return still and self.board.state is not BoardState.ARMED
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 
 import numpy as np
@@ -25,20 +26,19 @@ PASSING: dict[FaultKind, float] = {
     FaultKind.BUS_OFF: 0.0,
     FaultKind.CABLE: 2.0,
 }
-# What lasts, and words of which a run that it ends must give one as its reason.
-LASTING: dict[FaultKind, tuple[str, ...]] = {
-    FaultKind.SERVO_STALL: ("SERVO_STALLED", "SERVO_OFFLINE", "stalled or offline"),
-    FaultKind.SERVO_OFFLINE: ("SERVO_OFFLINE", "SERVO_STALLED", "stalled or offline"),
-    FaultKind.CLUTCH_DEAD: ("seated",),
-    FaultKind.CLUTCH_STUCK: ("NOT_RELEASED", "CLUTCH_IN"),
-    FaultKind.ENCODER_STUCK: ("WHEEL_STILL", "seated", "encoder"),
-    FaultKind.ENCODER_PARITY: ("ENCODER_FAULT", "encoder"),
-    FaultKind.ENCODER_MAGNET: ("ENCODER_FAULT", "encoder"),
-}
-# What is over when it is reported, but whoever reports it cannot know that: it is to be repaired.
-REPORTED: dict[FaultKind, tuple[str, ...]] = {
-    **LASTING,
-    FaultKind.CLUTCH_SLIP: ("WHEEL_STILL", "its wheel moved"),
+# What lasts, and what of a reason tells of it, with {n} for the servo or tendon.
+_SERVO = r"SERVO_(STALLED|OFFLINE) \({n}\)|\[.*\b{n}\b.*\] stalled or offline|servo {n} is at fault"
+_WHEEL = r"WHEEL_STILL \({n}\)|tendon {n}: its wheel"
+_SEATED = r"clutch {n} not seated"
+_FLAGS = r"ENCODER_FAULT \({n}\)|encoder of wheel {n} flags"
+LASTING: dict[FaultKind, str] = {
+    FaultKind.SERVO_STALL: _SERVO,
+    FaultKind.SERVO_OFFLINE: _SERVO,
+    FaultKind.CLUTCH_DEAD: _SEATED,
+    FaultKind.CLUTCH_STUCK: r"NOT_RELEASED, clutches \[.*\b{n}\b.*\]",
+    FaultKind.ENCODER_STUCK: f"{_WHEEL}|{_SEATED}",
+    FaultKind.ENCODER_PARITY: _FLAGS,
+    FaultKind.ENCODER_MAGNET: _FLAGS,
 }
 TRIGGERS = ("AXIAL", "ENGAGE", "START", "RELEASE")
 
@@ -67,15 +67,14 @@ class Scenario:
     stream_divider: int
 
     @property
-    def lasting(self) -> tuple[FaultKind, ...]:
-        """Kinds of faults that do not pass."""
-        return tuple(f.kind for f in self.faults if f.for_s is None and f.kind in LASTING)
+    def lasting(self) -> tuple[FaultConfig, ...]:
+        """Faults that do not pass."""
+        return tuple(f for f in self.faults if f.for_s is None and f.kind in LASTING)
 
-    @property
-    def true_reasons(self) -> tuple[str, ...]:
-        """Words of which a run that stops for good must give one."""
-        kinds = {f.kind for f in self.faults if f.kind in REPORTED}
-        return tuple(word for kind in sorted(kinds) for word in REPORTED[kind])
+    def explains(self, reason: str) -> bool:
+        """Whether a reason names what lasts, and the servo or tendon that has it."""
+        told = (LASTING[f.kind].format(n=f.index) for f in self.lasting)
+        return any(re.search(pattern, reason) for pattern in told)
 
 
 def draw(robot: Robot, seed: int) -> Scenario:

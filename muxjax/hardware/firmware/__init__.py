@@ -20,6 +20,7 @@ from muxjax.hardware import protocol
 from muxjax.hardware.codec import database
 from muxjax.hardware.encoders import COUNTS_PER_RAD
 from muxjax.hardware.guards import COMPARE_EVERY, FOLLOW, PATIENCE, WINDOW_COUNTS
+from muxjax.hardware.interlocks import TURNS_SLACK_M
 from muxjax.hardware.physics import PhysicsConfig
 from muxjax.hardware.sensing import BAD_SAMPLES
 from muxjax.hardware.virtual_board import (
@@ -145,6 +146,7 @@ def config_source(robot: Robot, physics: PhysicsConfig) -> str:
         "facing": "&facing[0][0]",
         "low_m": "low_m",
         "high_m": "high_m",
+        "turns_slack_m": _number(TURNS_SLACK_M),
         "metres_per_servo_bit": _number(
             1 / (protocol.SERVO_BITS_PER_RAD * float(robot.servo_per_metre))
         ),

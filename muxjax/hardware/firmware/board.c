@@ -650,7 +650,9 @@ static struct refused check_turns(const struct board *b, int32_t arg)
         return refuse(TDMA_REASON_TURNS_UNKNOWN, (uint16_t)(wheel + 1));
     }
     double length = told * b->config->metres_per_count;
-    bool inside = b->config->low_m[wheel] <= length && length <= b->config->high_m[wheel];
+    double slack = b->config->turns_slack_m;
+    bool inside = b->config->low_m[wheel] - slack <= length
+        && length <= b->config->high_m[wheel] + slack;
     return inside ? FINE : refuse(TDMA_REASON_TENDON_RANGE, (uint16_t)(wheel + 1));
 }
 

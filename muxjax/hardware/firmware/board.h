@@ -32,6 +32,7 @@ struct board_config {
     const uint8_t *facing; /* tendon that a servo meets, [position][servo] */
     const double *low_m; /* range of each tendon, margin for rounding included */
     const double *high_m;
+    double turns_slack_m; /* so far beyond it TURNS is believed: clutches slip */
     double metres_per_servo_bit; /* 0.1 degree of servo to tendon displacement */
     double metres_per_count;     /* wheel encoder to tendon displacement */
     double servo_bits_per_s;     /* full speed */

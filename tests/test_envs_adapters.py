@@ -19,12 +19,13 @@ import muxjax
 from envs.config import TdmaConfig, load_env_config
 from envs.gymnasium_adapter import CONTINUOUS, DISCRETE, TdmaEnv, TdmaVectorEnv
 from envs.sb3_adapter import TdmaVecEnv
+from envs.tdma import Tdma
 from muxjax.config import ConfigError
 from muxjax.hardware.links import LockstepLink
 from muxjax.planning.checkpoint import CheckpointError
 from tests.test_envs import actions_of, random_target
 from training.config import RlConfig
-from training.policy import Policy, load_policy
+from training.policy import Policy, evaluation_problems, load_policy
 from training.train_rl import fit
 
 ONE_SERVO = TdmaConfig(schema="muxjax/env/1", servo_sets=((1,),), time_limit=3)
@@ -264,3 +265,15 @@ def test_continuous_training_runs_and_its_policy_fits_no_other_actions(tmp_path,
         load_policy(tmp_path)
     with pytest.raises(CheckpointError, match="is no training"):
         load_policy(tmp_path / "nowhere")
+
+
+@pytest.mark.usefixtures("one_thread")
+@pytest.mark.parametrize("name", ["one_servo", "muxarm"])
+def test_shipped_policies_are_near_the_optimum(name, muxarm):
+    policy = load_policy(muxjax.config.data_folder("checkpoints") / "policies" / name)
+    problems = evaluation_problems(Tdma(policy.config, robot=muxarm), 12, seed=3)
+    plans = [policy.plan(muxarm, problem) for problem in problems]
+    best = [muxjax.plan(muxarm, problem).cost for problem in problems]
+    gaps = [plan.cost / cost - 1.0 for plan, cost in zip(plans, best, strict=True)]
+    assert min(gaps) >= -1e-9
+    assert np.median(gaps) <= 0.02

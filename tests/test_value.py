@@ -151,3 +151,10 @@ def test_wrong_checkpoints_are_refused_with_the_reason(muxarm, net, tmp_path):
         load_value(tmp_path / "missing.value", muxarm)
     with pytest.raises(CheckpointError, match="no 'nobody' among the shipped ones"):
         load_value("nobody", muxarm)
+
+
+@pytest.mark.parametrize("name", ["muxarm", "penta"])
+def test_shipped_networks_fit_their_robots(name):
+    net, header = load_value(name, muxjax.load_robot(name))
+    assert header["about"]["config"]["robot"] == name
+    assert all(np.isfinite(w).all() for w in net.weights)

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 import tyro
 from matplotlib.figure import Figure
+from matplotlib.ticker import NullFormatter
 
 from muxjax.config import ConfigError
 from training.compare import Record, by_method, front, gaps
@@ -115,7 +116,10 @@ def _draw_front(panel: Any, records: Sequence[Record]) -> None:
         *zip(*ahead, strict=True), where="post", color="k", linewidth=0.8, label="front", zorder=0
     )
     panel.set_xscale("log")
+    panel.xaxis.set_major_formatter("{x:g}")
+    panel.xaxis.set_minor_formatter(NullFormatter())  # its labels run into each other
     panel.set_yscale("symlog", linthresh=1.0)
+    panel.yaxis.set_major_formatter("{x:g}")
     panel.set_ylim(bottom=-0.1)
     panel.grid(alpha=0.3)
 

@@ -19,7 +19,6 @@ from typing import Any, Literal
 import equinox as eqx
 import numpy as np
 from jaxtyping import Bool, Float
-from scipy.signal import savgol_filter
 from scipy.spatial.transform import Rotation
 
 from muxjax.statics.chain import ElasticChain
@@ -253,6 +252,8 @@ def static_samples(motion: Recording) -> Bool[np.ndarray, " P"]:
 
     Derivatives are those of parabolas through a second of samples around each.
     """
+    from scipy.signal import savgol_filter  # takes a quarter of a second to import
+
     dt = float(motion.time[1] - motion.time[0])
     window = 2 * round(0.5 / dt) + 1
     tip = motion.segment_ends[:, -1, :3, 3]

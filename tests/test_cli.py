@@ -317,6 +317,7 @@ def test_the_methods_of_the_command_line_are_the_planners():
     assert set(get_args(Method)) == set(METHODS)
 
 
+@pytest.mark.slow
 def test_a_refusing_planner_does_not_end_the_demo(muxjax, tmp_path):
     task = tmp_path / "task.yaml"
     task.write_text(

@@ -86,10 +86,10 @@ def core(max_step_mm, objective):
 
 
 def _method_cases():
-    """Every objective with each planner; the exact and the beam's tables of "gentle" take long."""
+    """Every objective with each planner; those of "gentle" take long."""
     for objective in OBJECTIVES:
         for method in ("greedy", "exact", "beamstep"):
-            marks = pytest.mark.slow if objective == "gentle" and method != "greedy" else ()
+            marks = pytest.mark.slow if objective == "gentle" else ()
             yield pytest.param(objective, method, None, marks=marks)
         yield objective, "greedy", 25.0
 
@@ -289,6 +289,7 @@ def among_obstacles(env):
         states = jax.vmap(env.autoreset)(after, outcome)
 
 
+@pytest.mark.slow
 def test_a_step_through_a_collision_ends_the_episode():
     env, seen = Tdma(load_env_config("cabinet")), []
     for states, _, after, outcome in among_obstacles(env):

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from itertools import combinations
 
+import jax
 import numpy as np
 import pytest
 from scipy.optimize import minimize
@@ -17,6 +18,12 @@ from muxjax.tendons import bending_from_displacements
 
 SERVO_SETS = [s for n in (1, 2, 3) for s in combinations((1, 2, 3), n)]
 Q = np.array([0.9, 0.4, 0.7, 2.5, 0.6, 4.0])
+
+
+def bending(robot, displacements):
+    """Bending vectors in the planners' precision."""
+    with jax.enable_x64(True):
+        return np.asarray(bending_from_displacements(robot, displacements)).ravel()
 
 
 @pytest.fixture
@@ -112,13 +119,12 @@ def test_without_the_axial_motor_the_closest_is_reached(muxarm, target, axial, s
     assert found.tendons == tuple(sorted(c + 1 for c in moving))
     still = [c for c in range(9) if c not in moving]
     assert (found.displacements[still] == held[still]).all()
-    wanted = np.asarray(bending_from_displacements(muxarm, target)).ravel()
+    wanted = bending(muxarm, target)
 
     def distance(moved):
         displacements = held.copy()
         displacements[moving] = moved
-        b = np.asarray(bending_from_displacements(muxarm, displacements)).ravel()
-        return np.linalg.norm(b - wanted)
+        return np.linalg.norm(bending(muxarm, displacements) - wanted)
 
     assert found.bending_error < distance(held[moving])
     other = minimize(distance, held[moving], method="Nelder-Mead", options={"xatol": 1e-7})

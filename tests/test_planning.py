@@ -261,7 +261,10 @@ def test_a_wide_beam_is_exact_and_certifies_itself(muxarm, rng):
         assert wide.cost == pytest.approx(plan(muxarm, problem).cost, rel=1e-12)
 
 
-@pytest.mark.parametrize("action_set", ["subsets", "all", "multistep", "splits"])
+@pytest.mark.parametrize(
+    "action_set",
+    ["subsets", "all", *(pytest.param(s, marks=pytest.mark.slow) for s in ("multistep", "splits"))],
+)
 def test_the_compiled_beam_is_the_one_on_the_host(muxarm, rng, action_set):
     """Whatever the width, the servos and the weights, as long as these leave no two plans equal."""
     weights = {"travel": 1.0, "bending": 0.005, "switches": 0.05, "overshoot": 0.0137}

@@ -190,7 +190,7 @@ class HeavyAndSlow(Heavy):
     expensive = True
 
 
-@pytest.mark.parametrize("kind", [Heavy, HeavyAndSlow])
+@pytest.mark.parametrize("kind", [Heavy, pytest.param(HeavyAndSlow, marks=pytest.mark.slow)])
 def test_a_term_with_data_works_in_every_planner(muxarm, rng, kind):
     target = random_targets(muxarm, rng, 1)[0] * (np.arange(9) % 2)  # four tendons move
     for factor in (np.ones(9), np.arange(9.0)):

@@ -75,6 +75,7 @@ def test_a_plan_goes_around(muxarm, blocked):
     )
 
 
+@pytest.mark.slow
 def test_closeness_has_a_price(muxarm, blocked):
     problem, _ = blocked
     shy = replace(problem, weights={"time": 1.0, "clearance": 1e4})
@@ -86,6 +87,7 @@ def test_closeness_has_a_price(muxarm, blocked):
     assert hasty.cost <= evaluate(muxarm, muxjax.schedule(muxarm, careful)).time_s + 1e-9
 
 
+@pytest.mark.slow
 def test_a_plan_that_does_not_exist_is_not_found(muxarm):
     """Every order leads through the wall: by the planners, and by a walk along every order."""
     target, world = muxjax.tendon_displacements(muxarm, UNDER_IT), world_of(FAR_BALL, WALL)

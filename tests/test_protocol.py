@@ -187,6 +187,7 @@ def bigger(robot: Robot, **changes: object) -> Robot:
     for path, value in changes.items():
         section, field = path.split("__")
         values[section][field]["value"] = value
+    values["cost"] = None  # the sheet counts the motors of the robot as it is
     return robot_from_config(RobotConfig.model_validate(values))
 
 

@@ -13,6 +13,9 @@ from __future__ import annotations
 import hashlib
 import json
 import math
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
 from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Any, Generic, Literal, Self, TypeVar
@@ -88,6 +91,40 @@ def load_yaml(model: type[AnyStrict], path: Path) -> AnyStrict:
         return model.model_validate(raw)
     except ValidationError as error:
         raise ConfigError(f"{path}: {explain(error)}") from error
+
+
+def load_json(model: type[AnyStrict], path: str | Path) -> AnyStrict:
+    """Read one JSON file into ``model``.
+
+    Raises:
+        ConfigError: No such file, not JSON, another schema or a wrong field; each named.
+    """
+    try:
+        return model.model_validate_json(Path(path).read_bytes())
+    except OSError as error:
+        raise ConfigError(f"{path}: cannot be read ({error.strerror})") from error
+    except ValidationError as error:
+        raise ConfigError(f"{path}: {explain(error)}") from error
+
+
+def save_json(document: Strict, path: str | Path) -> None:
+    """Write a document as JSON; a file of that name is replaced whole or not at all."""
+    with replacing(path) as part:
+        part.write_text(document.model_dump_json(by_alias=True, indent=2) + "\n", encoding="utf-8")
+
+
+@contextmanager
+def replacing(path: str | Path) -> Iterator[Path]:
+    """A path beside this one to write to; what was written then takes this one's place.
+
+    A writer that dies or raises leaves the old file as it was. The folder is made. The name keeps
+    its suffix, by which some writers know their format.
+    """
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    part = path.with_name(f"{path.stem}.part{path.suffix}")
+    yield part
+    os.replace(part, path)
 
 
 def explain(error: ValidationError) -> str:

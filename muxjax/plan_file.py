@@ -6,9 +6,9 @@ from pathlib import Path
 from typing import Annotated, Literal, Self
 
 import numpy as np
-from pydantic import Field, ValidationError, model_validator
+from pydantic import Field, model_validator
 
-from muxjax.config import ConfigError, NotNegative, Positive, Strict, explain
+from muxjax.config import ConfigError, NotNegative, Positive, Strict, load_json, save_json
 from muxjax.planning.problem import Plan, Problem
 
 Whole = Annotated[int, Field(ge=1)]
@@ -108,11 +108,7 @@ def save_plan(plan: Plan, path: str | Path) -> None:
             action_set=problem.action_set,
         ),
     )
-    path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    torn = path.with_name(path.name + ".part")
-    torn.write_text(document.model_dump_json(by_alias=True, indent=2) + "\n", encoding="utf-8")
-    torn.replace(path)
+    save_json(document, path)
 
 
 def load_plan(path: str | Path) -> Plan:
@@ -122,12 +118,7 @@ def load_plan(path: str | Path) -> Plan:
         ConfigError: No such file, not JSON, another schema, a wrong field, or a plan that does
             not go from its problem's start to its target; each named.
     """
-    try:
-        found = PlanFile.model_validate_json(Path(path).read_bytes())
-    except OSError as error:
-        raise ConfigError(f"{path}: cannot be read ({error.strerror})") from error
-    except ValidationError as error:
-        raise ConfigError(f"{path}: {explain(error)}") from error
+    found = load_json(PlanFile, path)
     given = found.problem
     try:
         problem = Problem(

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
-from muxjax.config import ConfigError
+from muxjax.config import ConfigError, replacing
 from muxjax.kinematics import forward_kinematics
 from muxjax.precision import pad_rows
 from muxjax.robot import Robot
@@ -107,27 +107,25 @@ def save_trajectory(samples: Samples, path: str | Path) -> None:
     path = Path(path)
     if path.suffix not in {".csv", ".npz"}:
         raise ConfigError(f"{path}: a trajectory's file ends in .csv or .npz")
-    path.parent.mkdir(parents=True, exist_ok=True)
-    torn = path.with_name(path.name + ".part")
-    if path.suffix == ".csv":
-        named = columns(samples)
-        with open(torn, "w", newline="", encoding="utf-8") as file:
-            writer = csv.writer(file)
-            writer.writerow(named)
-            writer.writerows(np.stack(list(named.values()), axis=-1).tolist())
-    else:
-        with open(torn, "wb") as file:
-            np.savez_compressed(
-                file,
-                schema=np.array(SCHEMA),
-                robot=np.array(samples.robot),
-                fingerprint=np.array(samples.fingerprint),
-                time_s=samples.time_s,
-                displacements_m=samples.displacements,
-                configuration_rad=samples.q,
-                tool_pose_m=samples.tool,
-            )
-    torn.replace(path)
+    with replacing(path) as part:
+        if path.suffix == ".csv":
+            named = columns(samples)
+            with open(part, "w", newline="", encoding="utf-8") as file:
+                writer = csv.writer(file)
+                writer.writerow(named)
+                writer.writerows(np.stack(list(named.values()), axis=-1).tolist())
+        else:
+            with open(part, "wb") as file:
+                np.savez_compressed(
+                    file,
+                    schema=np.array(SCHEMA),
+                    robot=np.array(samples.robot),
+                    fingerprint=np.array(samples.fingerprint),
+                    time_s=samples.time_s,
+                    displacements_m=samples.displacements,
+                    configuration_rad=samples.q,
+                    tool_pose_m=samples.tool,
+                )
 
 
 def _quaternions(poses: Float[np.ndarray, "T 4 4"]) -> Float[np.ndarray, "T 4"]:

@@ -153,7 +153,8 @@ def main(options: Options) -> None:
         return
     problems = read_problems(file, robot)
     options.out.mkdir(parents=True, exist_ok=True)
-    nets = {name: load_value(name, robot)[0] for name in options.nets}
+    loaded = {name: load_value(name, robot) for name in options.nets}
+    nets = {name: net for name, (net, _) in loaded.items()}
     policies = {str(folder): load_policy(folder) for folder in options.policies}
     records: list[Record] = []
     for regime in config.regimes:
@@ -174,7 +175,7 @@ def main(options: Options) -> None:
             kept.write_text(json.dumps([asdict(r) for r in found]))
             records += found
             print(f"{regime.name} {number + 1}/{regime.problems}", flush=True)
-    spent = [load_value(name, robot)[1]["about"]["cpu_s"] for name in options.nets]
+    spent = [header["about"]["cpu_s"] for _, header in loaded.values()]
     training_s = float(np.mean([sum(cpu_s.values()) for cpu_s in spent])) if spent else 0.0
     text = report(config, records, training_s)
     (options.out / "report.md").write_text(text)
@@ -220,8 +221,12 @@ def methods(
             if width <= widest:
                 yield f"{name} {width}", net_name, partial(_beam, heuristic, width, net)
     for name, policy in policies.items():
-        trained_in = Path(name).name.rsplit("_", 1)[0]  # the rest tells the seed
-        yield f"{METHOD} {trained_in}", name, partial(_whole, partial(_acted, policy))
+        yield f"{METHOD} {trained_in(Path(name))}", name, partial(_whole, partial(_acted, policy))
+
+
+def trained_in(folder: Path) -> str:
+    """What a policy's folder is called, without the last part of its name, which tells the seed."""
+    return folder.name.rsplit("_", 1)[0]
 
 
 def _whole(method: Callable[[Lattice], Plan], lattice: Lattice) -> Outcome:
@@ -322,24 +327,34 @@ def by_method(records: Sequence[Record]) -> dict[str, list[Record]]:
 
 def gaps(records: Sequence[Record]) -> dict[str, Float[np.ndarray, " n"]]:
     """Cost of each method over the least known one of the same problem, where it has a plan [%]."""
-    best: dict[int, float] = defaultdict(lambda: inf)
-    for r in records:
-        best[r.number] = min(best[r.number], r.cost)
+    best = _least_costs(records)
     return {
         name: np.array([100 * (r.cost / best[r.number] - 1) for r in rows if isfinite(r.cost)])
         for name, rows in by_method(records).items()
     }
 
 
+def _least_costs(records: Sequence[Record]) -> dict[int, float]:
+    """By number of the problem."""
+    best: dict[int, float] = defaultdict(lambda: inf)
+    for r in records:
+        best[r.number] = min(best[r.number], r.cost)
+    return best
+
+
+def medians(records: Sequence[Record]) -> dict[str, tuple[float, float]]:
+    """Time with tables [ms] and gap [%] of each method that solves all problems."""
+    over = gaps(records)
+    return {
+        name: (float(np.median([r.total_ms for r in rows])), float(np.median(over[name])))
+        for name, rows in by_method(records).items()
+        if len(over[name]) == len(rows)
+    }
+
+
 def front(records: Sequence[Record]) -> list[str]:
     """Methods that solve all problems, with none of them both quicker and better in the median."""
-    points = {
-        name: (float(np.median(gap)), float(np.median([r.total_ms for r in rows])))
-        for (name, rows), gap in zip(
-            by_method(records).items(), gaps(records).values(), strict=True
-        )
-        if len(gap) == len(rows)
-    }
+    points = medians(records)
     return [name for name in points if not dominated_by(name, points)]
 
 
@@ -386,16 +401,14 @@ def _seeds(records: Sequence[Record]) -> str:
     names = sorted({net for _, net in over})
     if len(names) < 2:
         return ""
-    best: dict[int, float] = defaultdict(lambda: inf)
-    for r in records:
-        best[r.number] = min(best[r.number], r.cost)
+    best = _least_costs(records)
     for r in records:
         if r.net and isfinite(r.cost):
             over[r.method, r.net].append(100 * (r.cost / best[r.number] - 1))
     lines = ["| method | over the best known [%], one training each |", "| --- | --- |"]
     for method in dict.fromkeys(method for method, _ in over):
-        medians = [np.median(over[key]) for key in over if key[0] == method and over[key]]
-        lines.append(f"| {method} | " + ", ".join(f"{m:.2f}" for m in medians) + " |")
+        found = [np.median(over[key]) for key in over if key[0] == method and over[key]]
+        lines.append(f"| {method} | " + ", ".join(f"{m:.2f}" for m in found) + " |")
     return "\n".join(lines)
 
 

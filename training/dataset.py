@@ -26,6 +26,7 @@ import numpy as np
 from jaxtyping import Float
 
 import muxjax
+from muxjax.config import replacing
 from muxjax.planning.beamstep import beamstep
 from muxjax.planning.bounds import bound_of
 from muxjax.planning.exact import DEFAULT_MEMORY
@@ -360,9 +361,8 @@ def _make(task: _Task) -> tuple[str, int, float]:
         if part is not None:
             parts.append(part)
     whole = Decisions(*(np.concatenate(column) for column in zip(*parts, strict=True)))
-    partial = task.path.with_suffix(".partial.npz")
-    np.savez(partial, **whole._asdict())
-    os.replace(partial, task.path)
+    with replacing(task.path) as beside:
+        np.savez(beside, **whole._asdict())
     return task.path.name, len(whole.bound), time.process_time() - began
 
 

@@ -12,7 +12,6 @@ best network as a checkpoint. The same command goes on where it stopped, to the 
 from __future__ import annotations
 
 import json
-import os
 import time
 from dataclasses import dataclass
 from functools import partial
@@ -28,7 +27,7 @@ import tyro
 from torch.utils.tensorboard import SummaryWriter
 
 import muxjax
-from muxjax.config import load_yaml
+from muxjax.config import load_yaml, replacing
 from muxjax.planning.checkpoint import save_value
 from muxjax.planning.value import ValueNet, n_features, turn_by_a_tendon, value_net
 from muxjax.robot import Robot
@@ -236,9 +235,8 @@ class _Trainer:
             np.where(improved, 0, progress.since + 1),
         )
         (self.out / "curve.json").write_text(json.dumps(self.curve, indent=0))
-        partial_file = self.out / "progress.eqx.partial"
-        eqx.tree_serialise_leaves(partial_file, after)
-        os.replace(partial_file, self.out / "progress.eqx")
+        with replacing(self.out / "progress.eqx") as part:
+            eqx.tree_serialise_leaves(part, after)
         return after
 
     @property

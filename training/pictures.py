@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
-from math import isfinite
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +17,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import NullFormatter
 
 from muxjax.config import ConfigError
-from training.compare import Record, by_method, front, gaps
+from training.compare import Record, front, medians, trained_in
 
 # By what orders the beam; shades and marks that are apart in grey, too.
 _STYLES = {
@@ -42,7 +41,7 @@ def curves(runs: tuple[Path, ...], out: Path = Path("out/curves.png")) -> int:
     axes: Any = figure.subplots(2, 1, sharex=True, height_ratios=(3, 1))
     names: list[str] = []
     for run in runs:
-        lines, name = _curve(run), run.name.rsplit("_", 1)[0]
+        lines, name = _curve(run), trained_in(run)
         first = name not in names
         names += [name] * first
         shade = f"C{names.index(name)}"
@@ -99,12 +98,7 @@ def picture_of_front(records: tuple[Path, ...], out: Path = Path("out/front.png"
 
 
 def _draw_front(panel: Any, records: Sequence[Record]) -> None:
-    over, times = gaps(records), {}
-    for name, rows in by_method(records).items():
-        solved = [r.total_ms for r in rows if isfinite(r.cost)]
-        if len(solved) == len(rows):
-            times[name] = float(np.median(solved))
-    points = {name: (times[name], float(np.median(over[name]))) for name in times}
+    points = medians(records)
     for guide, (shade, mark) in _STYLES.items():
         own = [p for name, p in points.items() if name.rsplit(" ", 1)[0] == guide]
         if own:

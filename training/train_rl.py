@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import json
 import math
-import os
 import time
 from dataclasses import dataclass
 from pathlib import Path
@@ -31,7 +30,7 @@ from envs.config import TdmaConfig, load_env_config
 from envs.gymnasium_adapter import made
 from envs.sb3_adapter import TdmaVecEnv
 from envs.tdma import Tdma
-from muxjax.config import load_yaml
+from muxjax.config import load_yaml, replacing
 from muxjax.planning import Problem, plan
 from training.config import RlConfig, keep_config
 from training.policy import Policy, check_fits, evaluation_problems, load_model, rollouts
@@ -187,9 +186,8 @@ class Evaluation(BaseCallback):
         return int(self.curve[-2]["steps"]) if len(self.curve) > 1 else 0
 
     def _keep(self, name: str) -> None:
-        partial_file = self.out / f"{name}.partial.zip"
-        self.model.save(partial_file)
-        os.replace(partial_file, self.out / f"{name}.zip")
+        with replacing(self.out / f"{name}.zip") as part:
+            self.model.save(part)
 
 
 def _score(line: dict[str, float]) -> tuple[float, float]:

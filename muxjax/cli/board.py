@@ -11,7 +11,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from muxjax.config import ConfigError
+from muxjax.config import ConfigError, replacing
 from muxjax.hardware import VirtualBoard
 from muxjax.hardware.serving import LOOPBACK, SlcanWire, SocketcandWire, serve
 from muxjax.program_file import load_program
@@ -100,9 +100,8 @@ def _keep(virtual: VirtualBoard, arm: Path) -> None:
         "displacements_m": virtual.mechanics.displacements.tolist(),
         "state": virtual.state.name,
     }
-    torn = arm.with_name(arm.name + ".part")
-    torn.write_text(json.dumps(document) + "\n", encoding="utf-8")
-    torn.replace(arm)
+    with replacing(arm) as part:
+        part.write_text(json.dumps(document) + "\n", encoding="utf-8")
 
 
 def _kept(robot: Robot, arm: Path) -> np.ndarray | None:

@@ -5,13 +5,13 @@ from __future__ import annotations
 import json as json_text
 import sys
 from pathlib import Path
-from typing import Annotated, Any, Union
+from typing import Annotated, Any
 
 import tyro
 from rich import box
 from rich.table import Table
 
-from muxjax.cli.output import console, print_json
+from muxjax.cli.output import choice_of, console, print_json
 from muxjax.config import ConfigError
 from muxjax.schemas import KINDS, check_file, json_schema, schema_line
 
@@ -99,12 +99,7 @@ def check(files: Annotated[tuple[Path, ...], tyro.conf.Positional], json: bool =
 
 
 _COMMANDS: dict[str, Any] = {"schema": schema, "check": check}
-_Choice: Any = Union[  # noqa: UP007 - built at run time, one member a subcommand
-    tuple(
-        Annotated[Any, tyro.conf.subcommand(name=name, constructor=call, prefix_name=False)]
-        for name, call in _COMMANDS.items()
-    )
-]
+_Choice: Any = choice_of(_COMMANDS)
 
 
 def config(command: tyro.conf.OmitArgPrefixes[_Choice]) -> int:

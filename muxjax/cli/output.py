@@ -5,9 +5,11 @@ from __future__ import annotations
 import json
 import math
 import sys
-from typing import Any
+from collections.abc import Callable, Mapping
+from typing import Annotated, Any, Union
 
 import numpy as np
+import tyro
 from rich.console import Console
 from scipy.spatial.transform import Rotation
 
@@ -15,6 +17,15 @@ from scipy.spatial.transform import Rotation
 console = Console(markup=False, highlight=False)
 if not console.is_terminal:
     console.width = 120  # a file or a pipe has no width; the default of 80 would break the tables
+
+
+def choice_of(commands: Mapping[str, Callable[..., Any]]) -> Any:
+    """Type of an argument that is one of these subcommands, its value what the command returns."""
+    members = (
+        Annotated[Any, tyro.conf.subcommand(name=name, constructor=call, prefix_name=False)]
+        for name, call in commands.items()
+    )
+    return Union[tuple(members)]  # noqa: UP007 - built at run time
 
 
 def notice(text: str) -> None:

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any, Literal, Union
+from typing import Annotated, Any, Literal
 
 import numpy as np
 import tyro
 from rich.table import Table
 
-from muxjax.cli.output import console, pose_document, print_json, row_of
+from muxjax.cli.output import choice_of, console, pose_document, print_json, row_of
 from muxjax.cli.poses import Xyz
 from muxjax.robot import load_robot
 from muxjax.statics import (
@@ -373,12 +373,7 @@ _COMMANDS: dict[str, Any] = {
     "calibrate": fit_chain,
     "experiment": experiment,
 }
-_Choice: Any = Union[  # noqa: UP007 - built at run time, one member a subcommand
-    tuple(
-        Annotated[Any, tyro.conf.subcommand(name=name, constructor=call, prefix_name=False)]
-        for name, call in _COMMANDS.items()
-    )
-]
+_Choice: Any = choice_of(_COMMANDS)
 
 
 def statics(command: tyro.conf.OmitArgPrefixes[_Choice]) -> int:

@@ -9,7 +9,6 @@ from __future__ import annotations
 import hashlib
 import io
 import json
-import os
 from collections.abc import Mapping
 from functools import lru_cache
 from pathlib import Path
@@ -17,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from muxjax.config import ConfigError, data_folder
+from muxjax.config import ConfigError, data_folder, replacing
 from muxjax.planning.value import FEATURES, ValueNet, n_features
 from muxjax.robot import Robot
 
@@ -55,9 +54,8 @@ def save_value(path: str | Path, net: ValueNet, robot: Robot, about: Mapping[str
         "digest": hashlib.sha256(content).hexdigest(),
         "about": dict(about),
     }
-    partial = path.with_name(path.name + ".partial")
-    partial.write_bytes(json.dumps(header).encode() + b"\\n" + content)
-    os.replace(partial, path)
+    with replacing(path) as part:
+        part.write_bytes(json.dumps(header).encode() + b"\\n" + content)
 
 
 def checkpoint_path(name_or_path: str | Path) -> Path:

@@ -4,7 +4,7 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
-EXTRAS := hardware,viz,train,dev
+EXTRAS := hardware,viz,train,docs,dev
 
 .PHONY: help demo test test-slow lint format clean
 

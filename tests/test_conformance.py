@@ -111,13 +111,15 @@ def test_a_board_that_lost_its_turns_is_told_them_if_the_arm_is_straight(muxarm)
 def test_over_a_bus_and_another_process(muxarm):
     """What does not hang on the times of a loaded machine."""
     command = [sys.executable, "-c", "from muxjax.cli import main; main()", "board", "--port", "0"]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as board:
-        line = board.stdout.readline()
-        bus = open_bus(line[line.index("{") :].strip())
-        with bus:
+    board = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+    try:
+        with open_bus(board.stdout.readline().partition(" on ")[2].strip()) as bus:
             found = run_checks(BusLink(bus, muxarm), just_powered=True, only=["powers_up_silent",
                                "handshake_in_order", "nonsense_is_refused", "sequence_window",
                                "broken_frames_are_refused"])  # fmt: skip
         board.send_signal(signal.SIGINT)
-        board.wait(20)
+        assert board.wait(20) == 0
+    finally:
+        board.kill()
+        board.communicate()
     assert [(f.name, f.verdict, f.reason) for f in found] == [(f.name, "pass", "") for f in found]

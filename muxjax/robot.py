@@ -8,8 +8,8 @@ from pathlib import Path
 import equinox as eqx
 import jax
 import numpy as np
+import scipy
 from jaxtyping import Bool, Float, Int
-from scipy.spatial.transform import RigidTransform, Rotation
 
 from muxjax.config import FrameConfig, RobotConfig, load_yaml, resolve
 
@@ -112,8 +112,8 @@ def robot_from_config(config: RobotConfig) -> Robot:
         tendon_radius=np.array(config.tendons.radius_m.value),
         tendon_azimuth=_azimuth_table(config),
         body_radius=np.array(config.body.disc_radius_m.value),
-        base=_frame(config.base_frame),
-        tool=_frame(config.tool_frame),
+        base=frame_pose(config.base_frame),
+        tool=frame_pose(config.tool_frame),
         gear_ratio=np.array(config.transmission.gear_ratio.value),
         wheel_radius=np.array(config.transmission.wheel_radius_m.value),
         servo_speed=np.array(config.servo.speed_rpm.value * 2 * np.pi / 60),
@@ -140,6 +140,9 @@ def _azimuth_table(config: RobotConfig) -> Float[np.ndarray, "S S J"]:
     return np.broadcast_to(own + within, (s, s, j)).copy()
 
 
-def _frame(frame: FrameConfig) -> Float[np.ndarray, "4 4"]:
-    turn = Rotation.from_euler("xyz", frame.rpy_deg, degrees=True)
-    return RigidTransform.from_components(frame.xyz_m, turn).as_matrix()
+def frame_pose(frame: FrameConfig) -> Float[np.ndarray, "4 4"]:
+    """Homogeneous transform [m] of a frame."""
+    if not any(frame.xyz_m) and not any(frame.rpy_deg):
+        return np.eye(4)  # most frames; scipy.spatial takes a fifth of a second to import
+    turn = scipy.spatial.transform.Rotation.from_euler("xyz", frame.rpy_deg, degrees=True)
+    return scipy.spatial.transform.RigidTransform.from_components(frame.xyz_m, turn).as_matrix()

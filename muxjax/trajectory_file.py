@@ -8,8 +8,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+import scipy
 from jaxtyping import Float
-from scipy.spatial.transform import Rotation
 
 from muxjax.config import ConfigError, replacing
 from muxjax.kinematics import forward_kinematics
@@ -133,7 +133,7 @@ def _quaternions(poses: Float[np.ndarray, "T 4 4"]) -> Float[np.ndarray, "T 4"]:
     found = np.full((len(poses), 4), np.nan)
     defined = np.isfinite(poses).all(axis=(1, 2))
     if defined.any():
-        turns = Rotation.from_matrix(poses[defined, :3, :3]).as_quat(
+        turns = scipy.spatial.transform.Rotation.from_matrix(poses[defined, :3, :3]).as_quat(
             scalar_first=True, canonical=True
         )
         against = np.sum(turns[1:] * turns[:-1], axis=-1) < 0

@@ -17,8 +17,8 @@ import xml.etree.ElementTree as ET
 from pathlib import Path
 
 import numpy as np
+import scipy
 from jaxtyping import Float
-from scipy.spatial.transform import Rotation
 
 from muxjax.kinematics import check_configuration
 from muxjax.robot import Robot
@@ -170,7 +170,9 @@ def _joint(
     root: ET.Element, name: str, kind: str, parent: str, child: str, at: Float[np.ndarray, "4 4"]
 ) -> ET.Element:
     joint = ET.SubElement(root, "joint", name=name, type=kind)
-    rpy = Rotation.from_matrix(at[:3, :3]).as_euler("xyz")  # fixed axes, as URDF has them
+    rpy = scipy.spatial.transform.Rotation.from_matrix(at[:3, :3]).as_euler(
+        "xyz"
+    )  # fixed axes, as URDF has them
     texts = (" ".join(repr(float(v) + 0.0) for v in row) for row in (at[:3, 3], rpy))
     ET.SubElement(joint, "origin", xyz=next(texts), rpy=next(texts))
     ET.SubElement(joint, "parent", link=parent)

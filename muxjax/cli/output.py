@@ -9,9 +9,9 @@ from collections.abc import Callable, Mapping
 from typing import Annotated, Any, Union
 
 import numpy as np
+import scipy
 import tyro
 from rich.console import Console
-from scipy.spatial.transform import Rotation
 
 # Units stand in square brackets, which would otherwise be taken for markup.
 console = Console(markup=False, highlight=False)
@@ -59,7 +59,7 @@ def row_of(values: Any, scale: float = 1.0, digits: int = 2) -> str:
 
 def pose_document(pose: Any) -> dict[str, Any]:
     """A pose in every common notation."""
-    turn = Rotation.from_matrix(pose[:3, :3])
+    turn = scipy.spatial.transform.Rotation.from_matrix(pose[:3, :3])
     return {
         "position_m": pose[:3, 3],
         "quaternion_wxyz": turn.as_quat(scalar_first=True, canonical=True),

@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import scipy
 from jaxtyping import Float
-from scipy.spatial.transform import Rotation
 
 # Columns of a table, or keys of a JSON object: (positions, their scale to metres).
 POSITIONS = {("x_mm", "y_mm", "z_mm"): 1e-3, ("x_m", "y_m", "z_m"): 1.0}
@@ -36,9 +36,13 @@ def pose_from(
         norm = float(np.linalg.norm(quaternion))
         if not abs(norm - 1) <= 1e-3:
             raise ValueError(f"{where}: quaternion has norm {norm:g}, must be 1")
-        pose[:3, :3] = Rotation.from_quat(quaternion, scalar_first=True).as_matrix()
+        pose[:3, :3] = scipy.spatial.transform.Rotation.from_quat(
+            quaternion, scalar_first=True
+        ).as_matrix()
     elif rpy_deg is not None:
-        pose[:3, :3] = Rotation.from_euler("xyz", rpy_deg, degrees=True).as_matrix()
+        pose[:3, :3] = scipy.spatial.transform.Rotation.from_euler(
+            "xyz", rpy_deg, degrees=True
+        ).as_matrix()
     if not np.isfinite(pose).all():
         raise ValueError(f"{where}: must be finite numbers")
     return pose

@@ -8,8 +8,8 @@ from pathlib import Path
 import equinox as eqx
 import jax
 import numpy as np
+import scipy
 from jaxtyping import Float
-from scipy.spatial import cKDTree
 
 from muxjax.config import ConfigError, Vector3
 
@@ -139,7 +139,7 @@ def around_points(
         )
     axes = [low[k] + spacing * np.arange(counts[k]) for k in range(3)]
     nodes = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
-    away, _ = cKDTree(points).query(nodes.reshape(-1, 3))
+    away, _ = scipy.spatial.cKDTree(points).query(nodes.reshape(-1, 3))
     return Grid(away.reshape(counts) - radius, low, np.full(3, spacing), free=True)
 
 

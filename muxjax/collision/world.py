@@ -10,9 +10,9 @@ from typing import Annotated, Literal
 import equinox as eqx
 import jax
 import numpy as np
+import scipy
 from jaxtyping import Float
 from pydantic import Field, model_validator
-from scipy.spatial.transform import Rotation
 
 from muxjax.collision.sampled import Grid, around_points, read_grid, read_points
 from muxjax.config import Positive, Strict, Vector3, load_yaml, resolve
@@ -185,7 +185,11 @@ def world_from_config(config: WorldConfig, folder: Path | None = None) -> World:
                 rounds.append((item.from_m, item.to_m, item.radius_m))
             case BoxConfig():
                 frame = np.eye(4)
-                frame[:3, :3] = Rotation.from_euler("xyz", item.rpy_deg, degrees=True).as_matrix().T
+                frame[:3, :3] = (
+                    scipy.spatial.transform.Rotation.from_euler("xyz", item.rpy_deg, degrees=True)
+                    .as_matrix()
+                    .T
+                )
                 frame[:3, 3] = -frame[:3, :3] @ np.array(item.centre_m)
                 boxes.append((frame, 0.5 * np.array(item.size_m)))
             case HalfSpaceConfig():

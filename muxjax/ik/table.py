@@ -7,8 +7,8 @@ from typing import NamedTuple
 
 import jax
 import numpy as np
+import scipy
 from jaxtyping import Float
-from scipy.spatial import cKDTree
 
 from muxjax.batched import poses
 from muxjax.ik.frames import inverse, quaternion
@@ -68,7 +68,7 @@ def bendings(robot: Robot, unit: Float[np.ndarray, "n dof"]) -> Float[np.ndarray
     return np.stack([theta * np.cos(phi), theta * np.sin(phi)], axis=-1).reshape(unit.shape)
 
 
-_trees: dict[tuple[int, bytes], tuple[Table, cKDTree]] = {}
+_trees: dict[tuple[int, bytes], tuple[Table, scipy.spatial.cKDTree]] = {}
 
 
 def nearest_entries(
@@ -93,7 +93,7 @@ def nearest_entries(
         if len(_trees) >= KEPT:
             _trees.pop(next(iter(_trees)))
         features = _features(robot, entries.position, entries.quaternion, weights)
-        _trees[key] = entries, cKDTree(features, balanced_tree=False)
+        _trees[key] = entries, scipy.spatial.cKDTree(features, balanced_tree=False)
     wanted = _features(robot, goal[:3].T, goal[3:], weights)
     ranks = np.arange(1 + first, 1 + first + count)
     _, index = _trees[key][1].query(wanted, k=ranks, eps=LOOSELY)

@@ -17,8 +17,8 @@ from itertools import combinations, pairwise
 from typing import Any
 
 import numpy as np
+import scipy
 from jaxtyping import Bool, Float
-from scipy.sparse.csgraph import dijkstra
 
 from muxjax.collision import World
 from muxjax.kinematics import bending_from_configuration, configuration_from_bending
@@ -193,7 +193,9 @@ class _Search:
         weight = self._weight.copy()
         for a, b in self.blocked:
             weight[a, b] = 0.0  # no edge, to scipy
-        reached, before = dijkstra(weight, indices=_START, return_predecessors=True)
+        reached, before = scipy.sparse.csgraph.dijkstra(
+            weight, indices=_START, return_predecessors=True
+        )
         if not np.isfinite(reached[_GOAL]):
             return None
         way = [_GOAL]

@@ -12,8 +12,8 @@ from typing import Any
 
 import jax
 import numpy as np
+import scipy
 from jaxtyping import Float
-from scipy.optimize import least_squares
 
 from muxjax.hardware import Link, MemoryJournal, Run, execute, resume
 from muxjax.hardware.executor import MEND_COUNTS, OnProgress
@@ -198,7 +198,9 @@ def without_axial_motor(
 
     low, high = displacement_range(robot)[moving].T
     inside = np.clip(held[moving], low + 1e-9, high - 1e-9)
-    found = least_squares(residual, inside, bounds=(low, high), x_scale=1e-2, xtol=1e-14)
+    found = scipy.optimize.least_squares(
+        residual, inside, bounds=(low, high), x_scale=1e-2, xtol=1e-14
+    )
     if not found.success:
         raise ValueError(f"target: the closest shape was not found ({found.message})")
     closest = at(found.x)

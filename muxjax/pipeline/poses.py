@@ -7,8 +7,8 @@ from typing import Any
 
 import jax
 import numpy as np
+import scipy
 from jaxtyping import Float
-from scipy.spatial.transform import RigidTransform, Rotation
 
 from muxjax.collision import World, clearance
 from muxjax.config import TargetConfig
@@ -69,10 +69,12 @@ class PosePlan:
 def target_pose(target: TargetConfig) -> Float[np.ndarray, "4 4"]:
     """Homogeneous transform of a target [m]."""
     if target.quaternion_wxyz is not None:
-        turn = Rotation.from_quat(target.quaternion_wxyz, scalar_first=True)
+        turn = scipy.spatial.transform.Rotation.from_quat(target.quaternion_wxyz, scalar_first=True)
     else:
-        turn = Rotation.from_euler("xyz", target.rpy_deg, degrees=True)
-    return RigidTransform.from_components(target.position_m, turn).as_matrix()
+        turn = scipy.spatial.transform.Rotation.from_euler("xyz", target.rpy_deg, degrees=True)
+    return scipy.spatial.transform.RigidTransform.from_components(
+        target.position_m, turn
+    ).as_matrix()
 
 
 def problem_for_pose(

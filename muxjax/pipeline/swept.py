@@ -14,8 +14,8 @@ from typing import NamedTuple
 import equinox as eqx
 import jax
 import numpy as np
+import scipy
 from jaxtyping import Float
-from scipy.spatial.transform import RigidTransform, Rotation, Slerp
 
 from muxjax.collision import World, clearance
 from muxjax.kinematics import configuration_from_bending
@@ -166,14 +166,16 @@ def base_path(
     """
     places, gaps = [poses[:1]], [np.zeros(0)]
     for begin, end in pairwise(poses):
-        turns = Rotation.from_matrix(np.stack([begin[:3, :3], end[:3, :3]]))
+        turns = scipy.spatial.transform.Rotation.from_matrix(np.stack([begin[:3, :3], end[:3, :3]]))
         angle = float((turns[1] * turns[0].inv()).magnitude())
         way = float(np.linalg.norm(end[:3, 3] - begin[:3, 3])) + angle * reach
         count = max(1, int(np.ceil(way / resolution)))
         share = np.arange(1, count + 1) / count
         at = begin[:3, 3] + share[:, None] * (end - begin)[:3, 3]
-        turned = Slerp([0.0, 1.0], turns)(share)
-        places.append(RigidTransform.from_components(at, turned).as_matrix())
+        turned = scipy.spatial.transform.Slerp([0.0, 1.0], turns)(share)
+        places.append(
+            scipy.spatial.transform.RigidTransform.from_components(at, turned).as_matrix()
+        )
         gaps.append(np.full(count, way / count))
     return np.concatenate(places), np.concatenate(gaps)
 

@@ -18,8 +18,8 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+import scipy
 from jaxtyping import Float
-from scipy.linalg import block_diag
 
 from muxjax.planning.arrays import BoundArrays, LatticeArrays
 from muxjax.planning.bounds import bound_of
@@ -275,4 +275,4 @@ def turn_by_a_tendon(robot: Robot) -> Float[np.ndarray, "F F"]:
     shift = np.roll(np.eye(j), 1, axis=0)
     rest = n_features(robot) - 4 * s * j - 4 * s - j - len(ACTION_SETS) - 1
     blocks = [*[shift] * (4 * s), *[rotate] * (2 * s), np.eye(rest), shift]
-    return np.asarray(block_diag(*blocks, np.eye(len(ACTION_SETS) + 1)))
+    return np.asarray(scipy.linalg.block_diag(*blocks, np.eye(len(ACTION_SETS) + 1)))

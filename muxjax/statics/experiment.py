@@ -18,8 +18,8 @@ from typing import Any, Literal
 
 import equinox as eqx
 import numpy as np
+import scipy
 from jaxtyping import Bool, Float
-from scipy.spatial.transform import Rotation
 
 from muxjax.statics.chain import ElasticChain
 from muxjax.statics.curvature import (
@@ -187,7 +187,7 @@ def _perturbed(chain: ElasticChain, size: Perturbation, rng: np.random.Generator
     mass[ends - 1] += size.holster_kg
     axis = rng.normal(size=2)
     tilt = np.radians(size.tilt_deg) * np.array([*axis, 0.0]) / np.linalg.norm(axis)
-    gravity = Rotation.from_rotvec(tilt).apply(chain.gravity)
+    gravity = scipy.spatial.transform.Rotation.from_rotvec(tilt).apply(chain.gravity)
     return eqx.tree_at(
         lambda c: (c.stiffness, c.tendon_stiffness, c.hole, c.mass, c.gravity),
         chain,
@@ -237,7 +237,9 @@ def _seen(
     ends = np.array(found.segment_ends)
     ends[..., :3, 3] += rng.normal(0, size.camera_noise_m, ends[..., :3, 3].shape)
     shape = ends.shape[:-2]
-    turn = Rotation.from_rotvec(rng.normal(0, size.camera_noise_rad, (int(np.prod(shape)), 3)))
+    turn = scipy.spatial.transform.Rotation.from_rotvec(
+        rng.normal(0, size.camera_noise_rad, (int(np.prod(shape)), 3))
+    )
     ends[..., :3, :3] = ends[..., :3, :3] @ turn.as_matrix().reshape(*shape, 3, 3)
     return Recording(
         time=np.arange(len(lengths)) / RATE,
@@ -282,7 +284,9 @@ def _means(motion: Recording, runs: list[np.ndarray]) -> Recording:
     ends = np.stack([motion.segment_ends[run].mean(axis=0) for run in runs])
     for k, run in enumerate(runs):
         for s in range(ends.shape[1]):
-            turns = Rotation.from_matrix(motion.segment_ends[run, s, :3, :3])
+            turns = scipy.spatial.transform.Rotation.from_matrix(
+                motion.segment_ends[run, s, :3, :3]
+            )
             ends[k, s, :3, :3] = turns.mean().as_matrix()
     return Recording(
         time=np.array([motion.time[run].mean() for run in runs]),

@@ -10,7 +10,6 @@ from typing import Annotated, Literal, NamedTuple
 import numpy as np
 from jaxtyping import Float
 from pydantic import Field, model_validator
-from scipy.spatial.transform import RigidTransform, Rotation
 
 from muxjax.config import (
     ConfigError,
@@ -24,7 +23,7 @@ from muxjax.config import (
     resolve,
 )
 from muxjax.precision import host_array
-from muxjax.robot import Robot
+from muxjax.robot import Robot, frame_pose
 from muxjax.statics.chain import ElasticChain
 
 AXES = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
@@ -204,8 +203,8 @@ def _assemble(
         tendon_stiffness=np.full(len(routing), config.tendon_stiffness_n_m.value),
         slack_width=np.array(config.slack_width_n.value),
         gravity=np.array(config.gravity_m_s2.value if config.gravity_m_s2 else (0.0, 0.0, 0.0)),
-        base=_frame(config.base_frame),
-        tip=ends[-1] @ _frame(config.tip_frame),
+        base=frame_pose(config.base_frame),
+        tip=ends[-1] @ frame_pose(config.tip_frame),
         end_frame=ends,
         routing=tuple(routing),
         segment_bodies=tuple(body for body, _ in parts.ends),
@@ -375,8 +374,3 @@ def _raised(height: float) -> Float[np.ndarray, "4 4"]:
     frame = np.eye(4)
     frame[2, 3] = height
     return frame
-
-
-def _frame(frame: FrameConfig) -> Float[np.ndarray, "4 4"]:
-    turn = Rotation.from_euler("xyz", frame.rpy_deg, degrees=True)
-    return RigidTransform.from_components(frame.xyz_m, turn).as_matrix()

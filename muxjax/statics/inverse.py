@@ -15,9 +15,8 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+import scipy
 from jaxtyping import Bool, Float
-from scipy.optimize import least_squares, lsq_linear
-from scipy.spatial.transform import Rotation
 
 from muxjax.precision import host_array
 from muxjax.statics import kernel as kn
@@ -205,7 +204,9 @@ def _hold_posture(
     unit = float(np.mean(chain.stiffness))
     sparing = np.sqrt(SPARING) * MOMENT_TOLERANCE**0.5 / high
     matrix = np.concatenate([pull / unit, np.diag(sparing)])
-    found = lsq_linear(matrix, np.concatenate([-rest / unit, 0 * sparing]), (low, high), tol=1e-14)
+    found = scipy.optimize.lsq_linear(
+        matrix, np.concatenate([-rest / unit, 0 * sparing]), (low, high), tol=1e-14
+    )
     tension = np.clip(found.x, low, high)
     error = float(np.abs(pull @ tension + rest).max())
     good = error <= MOMENT_TOLERANCE * unit
@@ -295,7 +296,11 @@ def _hold_pose(
         tip = at(tension).pose
         parts = [(tip[:3, 3] - goal[:3, 3]) / length]
         if turning:
-            parts.append(Rotation.from_matrix(goal[:3, :3].T @ tip[:3, :3]).as_rotvec())
+            parts.append(
+                scipy.spatial.transform.Rotation.from_matrix(
+                    goal[:3, :3].T @ tip[:3, :3]
+                ).as_rotvec()
+            )
         return np.concatenate([*parts, heavier * sparing * tension])
 
     def derivative(tension: Array) -> Array:
@@ -306,7 +311,9 @@ def _hold_pose(
             )
         rows = [change[:, :3, 3].T / length]
         if turning:
-            relative = Rotation.from_matrix(goal[:3, :3].T @ eq.pose[:3, :3])
+            relative = scipy.spatial.transform.Rotation.from_matrix(
+                goal[:3, :3].T @ eq.pose[:3, :3]
+            )
             spin = np.swapaxes(eq.pose[:3, :3][None], -1, -2) @ change[:, :3, :3]
             body = np.stack([spin[:, 2, 1], spin[:, 0, 2], spin[:, 1, 0]], axis=0)
             rows.append(_inverse_right_jacobian(relative.as_rotvec()) @ body)
@@ -316,7 +323,7 @@ def _hold_pose(
     for stage in SPARING_STAGES:
         heavier = stage
         inner = np.clip(tension, low + 1e-6 * (high - low), high - 1e-6 * (high - low))
-        found = least_squares(
+        found = scipy.optimize.least_squares(
             error,
             inner,
             derivative,
@@ -332,7 +339,11 @@ def _hold_pose(
     away = float(np.linalg.norm(eq.pose[:3, 3] - goal[:3, 3]))
     angle = 0.0
     if turning:
-        angle = float(Rotation.from_matrix(goal[:3, :3].T @ eq.pose[:3, :3]).magnitude())
+        angle = float(
+            scipy.spatial.transform.Rotation.from_matrix(
+                goal[:3, :3].T @ eq.pose[:3, :3]
+            ).magnitude()
+        )
     near = away <= POSITION_TOLERANCE and angle <= ANGLE_TOLERANCE
     reason = "held"
     if not bool(eq.converged):

@@ -15,9 +15,8 @@ from dataclasses import dataclass
 import jax
 import jax.numpy as jnp
 import numpy as np
+import scipy
 from jaxtyping import Float
-from scipy.optimize import least_squares
-from scipy.spatial.transform import RigidTransform, Rotation
 
 from muxjax.kinematics import (
     bending_from_configuration,
@@ -83,9 +82,13 @@ class TubeLine:
         if np.linalg.norm(x) < 1e-3:
             x = turn[:, 2] - (turn[:, 2] @ z) * z
         x = x / np.linalg.norm(x)
-        axes = Rotation.from_matrix(np.stack([x, np.cross(z, x), z], axis=1))
+        axes = scipy.spatial.transform.Rotation.from_matrix(
+            np.stack([x, np.cross(z, x), z], axis=1)
+        )
         return np.asarray(
-            RigidTransform.from_components(self.points[0] - back * z, axes).as_matrix()
+            scipy.spatial.transform.RigidTransform.from_components(
+                self.points[0] - back * z, axes
+            ).as_matrix()
         )
 
 
@@ -121,7 +124,9 @@ def posture_at(
         bent = np.asarray(bending_from_configuration(before.q), dtype=np.float64).reshape(-1)
         shift = nominal[:3, :3].T @ (before.base[:3, 3] - nominal[:3, 3])
         advance = np.array([0.0, 0.0, depth - before.depth])
-        turned = Rotation.from_matrix(nominal[:3, :3].T @ before.base[:3, :3]).as_rotvec()
+        turned = scipy.spatial.transform.Rotation.from_matrix(
+            nominal[:3, :3].T @ before.base[:3, :3]
+        ).as_rotvec()
         guess = np.concatenate([shift + advance, turned, bent])
     weight = np.where(inside, 1.0, OUTSIDE)
     limit = np.repeat(np.asarray(robot.theta_max), 2)
@@ -133,7 +138,7 @@ def posture_at(
         with jax.enable_x64(True):
             # SciPy's first trust region is as large as its first guess: not next to nothing.
             v[2] += 1e-3
-            v = least_squares(
+            v = scipy.optimize.least_squares(
                 lambda x, data=data: np.asarray(_residual(robot, x, *data)),
                 np.clip(v, low + 1e-9, -low - 1e-9),
                 jac=lambda x, data=data: np.asarray(_jacobian(robot, x, *data)),

@@ -34,7 +34,7 @@ from muxjax.pipeline.missions.files import (
     Step,
 )
 from muxjax.pipeline.missions.follow import Posture, TubeLine, posture_at
-from muxjax.pipeline.missions.scene import Scene, Worlds, first_scene, frame_pose, grasped, released
+from muxjax.pipeline.missions.scene import Scene, Worlds, first_scene, grasped, released
 from muxjax.pipeline.poses import target_pose
 from muxjax.pipeline.swept import (
     RESOLUTION,
@@ -46,7 +46,7 @@ from muxjax.pipeline.swept import (
 )
 from muxjax.planning import Plan, PlanningError, Problem, plan
 from muxjax.planning.world import SWEEP_TOLERANCE
-from muxjax.robot import Robot
+from muxjax.robot import Robot, frame_pose
 from muxjax.scheduler import Program
 from muxjax.tendons import tendon_displacements
 

@@ -7,14 +7,12 @@ from dataclasses import dataclass, replace
 import equinox as eqx
 import numpy as np
 from jaxtyping import Float
-from scipy.spatial.transform import RigidTransform, Rotation
 
 from muxjax.collision import SphereConfig, World, WorldConfig, world_from_config
-from muxjax.config import FrameConfig
 from muxjax.kinematics import forward_kinematics
 from muxjax.pipeline.missions.files import MissionConfig
 from muxjax.pipeline.swept import at_base
-from muxjax.robot import Robot
+from muxjax.robot import Robot, frame_pose
 from muxjax.tendons import configuration_from_tendons
 
 # An object that is held is no obstacle, and one that is not held is no part of the tool. So that
@@ -42,12 +40,6 @@ class Scene:
     centres: Float[np.ndarray, "objects 3"]
     held: int | None = None
     offset: Float[np.ndarray, " 3"] | None = None
-
-
-def frame_pose(frame: FrameConfig) -> Float[np.ndarray, "4 4"]:
-    """Homogeneous transform of a frame [m]."""
-    turn = Rotation.from_euler("xyz", frame.rpy_deg, degrees=True)
-    return np.asarray(RigidTransform.from_components(frame.xyz_m, turn).as_matrix())
 
 
 def first_scene(robot: Robot, mission: MissionConfig) -> Scene:

@@ -23,9 +23,8 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-import scipy.optimize
+import scipy
 from jaxtyping import Bool, Float
-from scipy.spatial.transform import Rotation
 
 from muxjax.config import load_yaml, resolve
 from muxjax.statics.calibration.measured import Measurements
@@ -189,7 +188,7 @@ class _Model:
         parts = [found.pose[:, :3, 3] - data.position]
         if data.rotation is not None:
             turn = np.swapaxes(data.rotation, -1, -2) @ found.pose[:, :3, :3]
-            parts.append(Rotation.from_matrix(turn).as_rotvec())
+            parts.append(scipy.spatial.transform.Rotation.from_matrix(turn).as_rotvec())
         if data.tension is not None:
             parts.append(found.tension - data.tension)
         return _Look(found, np.concatenate(parts, axis=-1), chain)

@@ -23,8 +23,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+import scipy
 from jaxtyping import Float, Int
-from scipy.spatial.transform import Rotation
 
 from muxjax.statics.chain import ElasticChain
 from muxjax.statics.checks import tendon_lengths
@@ -168,7 +168,7 @@ def _check_quaternion(values: np.ndarray | None, lines: np.ndarray, source: str)
 def _rotation(quaternion: np.ndarray | None) -> np.ndarray | None:
     if quaternion is None:
         return None
-    return Rotation.from_quat(quaternion, scalar_first=True).as_matrix()
+    return scipy.spatial.transform.Rotation.from_quat(quaternion, scalar_first=True).as_matrix()
 
 
 def _check_sizes(data: Measurements, chain: ElasticChain, tension: np.ndarray | None) -> None:

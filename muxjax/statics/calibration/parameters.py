@@ -12,8 +12,8 @@ from typing import Any, Literal, NamedTuple
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
+import scipy
 from jaxtyping import Float, Int
-from scipy.spatial.transform import Rotation
 
 from muxjax.kinematics import stumpff
 from muxjax.statics.chain import ElasticChain
@@ -272,8 +272,12 @@ def _write_base(
     document: dict[str, Any], config: ChainConfig, values: Mapping[str, float], why: str
 ) -> None:
     """Base frames have no source of their own; where there is gravity, it says why."""
-    old = Rotation.from_euler("xyz", config.base_frame.rpy_deg, degrees=True)
-    turn = Rotation.from_rotvec([values.get(f"base_r{a}", 0.0) for a in "xyz"])
+    old = scipy.spatial.transform.Rotation.from_euler(
+        "xyz", config.base_frame.rpy_deg, degrees=True
+    )
+    turn = scipy.spatial.transform.Rotation.from_rotvec(
+        [values.get(f"base_r{a}", 0.0) for a in "xyz"]
+    )
     place = [values.get(f"base_{a}", config.base_frame.xyz_m[i]) for i, a in enumerate("xyz")]
     new = turn * old
     rpy = [float(x) for x in new.as_euler("xyz", degrees=True)]

@@ -19,7 +19,7 @@ from mkdocs.structure.files import File
 # A link out of docs: "](../configs/x.yaml)" in docs/page.md, "](../../configs/x.yaml)" one deeper.
 LINK = re.compile(r"\]\(((?:\.\./)+[^)#\s]+)\)")
 EQUATION = re.compile(r'<(span|div) class="arithmatex">\\[(\[](.*?)\\[)\]]</\1>', re.DOTALL)
-EM = 10.0  # units of the drawing's font size
+EM = TextToPath.FONT_SCALE / 1.08  # a drawing's units to the em; the letters are a little small
 LETTERS = {
     Outline.MOVETO: ("M", 1),
     Outline.LINETO: ("L", 1),
@@ -67,25 +67,21 @@ def _in_repository(page: str, link: str, docs: Path) -> str | None:
 
 def _drawn(formula: str, *, display: bool) -> str:
     """A formula as inline SVG in the text's colour and size, by matplotlib's mathtext."""
-    text = f"${' '.join(formula.split())}$"
-    font = FontProperties(size=EM, math_fontfamily="cm")
-    points, codes = TextToPath().get_text_path(font, text, ismath=True)
-    outline = Outline(points, codes)
-    box = outline.get_extents()
-    left, low, right, top = box.x0 - 0.5, box.y0 - 0.5, box.x1 + 0.5, box.y1 + 0.5
+    font = FontProperties(math_fontfamily="cm")
+    points, codes = TextToPath().get_text_path(font, f"${' '.join(formula.split())}$", ismath=True)
+    box = Outline(points, codes).get_extents().padded(EM / 25)
     strokes: list[str] = []
     i = 0
     while i < len(codes):
         letter, n = LETTERS[codes[i]]
-        corners = "" if letter == "Z" else " ".join(f"{x:.2f} {-y:.2f}" for x, y in points[i : i + n])
-        strokes.append(letter + corners)
+        corners = (f"{x:.1f} {-y:.1f}" for x, y in points[i : i + n] if letter != "Z")
+        strokes.append(letter + " ".join(corners))
         i += n
-    scale = 12.0 if display else 11.0  # font size 10 in the drawing, in hundredths of an em
-    size = f"width:{(right - left) * scale / 100:.3f}em;height:{(top - low) * scale / 100:.3f}em"
-    place = "" if display else f";vertical-align:{low * scale / 100:.3f}em"
+    size = f"width:{box.width / EM:.3f}em;height:{box.height / EM:.3f}em"
+    place = "" if display else f";vertical-align:{box.y0 / EM:.3f}em"
     svg = (
         f'<svg class="equation" role="img" aria-label="{html.escape(formula)}" style="{size}{place}" '
-        f'viewBox="{left:.2f} {-top:.2f} {right - left:.2f} {top - low:.2f}">'
+        f'viewBox="{box.x0:.1f} {-box.y1:.1f} {box.width:.1f} {box.height:.1f}">'
         f'<path fill="currentColor" d="{"".join(strokes)}"/></svg>'
     )
     return f'<div class="equation">{svg}</div>' if display else svg

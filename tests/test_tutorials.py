@@ -21,6 +21,7 @@ ROOT = Path(__file__).resolve().parent.parent
 FOLDER = ROOT / "docs" / "tutorials"
 TRAININGS = {"train_a_guide", "reinforcement_learning"}
 SCRIPTS = sorted(path.stem for path in FOLDER.glob("*.py"))
+SLOW = {"own_cost_term"}  # compiles a planner for each of its terms
 NUMBER = re.compile(r"[-+]?\d+(?:\.\d+)?")
 # Figures of a training depend on how a processor rounds; the others only in their last digit.
 LOOSE, CLOSE = {"rel": 0.5, "abs": 0.5}, {"rel": 0.02, "abs": 0.02}
@@ -77,7 +78,14 @@ def test_agreement_is_of_words_and_numbers():
     assert not agree("10 steps: gap 0.09, 9 s", "10 steps: gap 0.02, ...", CLOSE)
 
 
-@pytest.mark.parametrize("script", [s for s in SCRIPTS if s not in TRAININGS])
+@pytest.mark.parametrize(
+    "script",
+    [
+        pytest.param(script, marks=pytest.mark.slow if script in SLOW else ())
+        for script in SCRIPTS
+        if script not in TRAININGS
+    ],
+)
 def test_prints_what_its_page_shows(root, script):
     lines, expected = printed(started(script, root)), shown(script)
     assert len(lines) == len(expected), lines

@@ -1,4 +1,4 @@
-"""The tutorials' scripts run as they stand, each in a process of its own, and print what their pages show.
+"""The tutorials' scripts run as they stand, each in a fresh process, and print what is shown.
 
 A page shows NAME.txt beside NAME.py. To renew it, run the script from the repository's root and
 keep its output; of a training, whose output is long, the lines that the page needs. A line that

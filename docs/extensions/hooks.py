@@ -1,7 +1,7 @@
-"""What the site's build does beyond MkDocs: equations as drawings, and links to files of the repository.
+r"""What the build does beyond MkDocs: equations as drawings, links to files of the repository.
 
 Pages are read in the repository too, so they say ``[robots](../configs/robots/muxarm.yaml)`` and
-``$\\theta$``. The site shows the same without fetching anything.
+``$\theta$``. The site shows the same without fetching anything.
 """
 
 from __future__ import annotations
@@ -79,9 +79,10 @@ def _drawn(formula: str, *, display: bool) -> str:
         i += n
     size = f"width:{box.width / EM:.3f}em;height:{box.height / EM:.3f}em"
     place = "" if display else f";vertical-align:{box.y0 / EM:.3f}em"
+    view = f"{box.x0:.1f} {-box.y1:.1f} {box.width:.1f} {box.height:.1f}"
     svg = (
-        f'<svg class="equation" role="img" aria-label="{html.escape(formula)}" style="{size}{place}" '
-        f'viewBox="{box.x0:.1f} {-box.y1:.1f} {box.width:.1f} {box.height:.1f}">'
+        f'<svg class="equation" role="img" aria-label="{html.escape(formula)}" '
+        f'style="{size}{place}" viewBox="{view}">'
         f'<path fill="currentColor" d="{"".join(strokes)}"/></svg>'
     )
     return f'<div class="equation">{svg}</div>' if display else svg

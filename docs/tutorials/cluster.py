@@ -21,6 +21,7 @@ elif "COORDINATOR" in os.environ:  # by hand: "host:port" of the first process
     )
 
 import muxjax  # after joining: JAX must not have started before
+
 # --8<-- [end:join]
 
 # %% --8<-- [start:sweep]

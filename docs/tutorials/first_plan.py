@@ -51,8 +51,6 @@ for number, step in enumerate(program.instructions, start=1):
 # %% --8<-- [start:run]
 run = muxjax.execute(program, muxjax.LockstepLink(robot))
 print(run.reason)
-arrived = muxjax.forward_kinematics(
-    robot, muxjax.configuration_from_tendons(robot, run.measured)
-)
+arrived = muxjax.forward_kinematics(robot, muxjax.configuration_from_tendons(robot, run.measured))
 print(f"tool off by {1e3 * np.linalg.norm(arrived[:3, 3] - pose[:3, 3]):.2f} mm")
 # --8<-- [end:run]

@@ -66,7 +66,8 @@ def _follow(lattice: Lattice, table: Table) -> tuple[list[Step] | None, str]:
         best = int(np.argmax(through <= through.min() + _EQUAL))
         if not np.isfinite(through[best]):
             return None, (
-                "every order passes through a state that is not defined, or whose cost is not finite"
+                "every order passes through a state that is not defined, "
+                "or whose cost is not finite"
             )
         stop = int(choices.stop[best])
         steps.append(Step(stop, choices.moves[best]))

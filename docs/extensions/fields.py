@@ -48,6 +48,6 @@ def _comment(source: list[str], field: ast.AnnAssign, first: int) -> str:
 
 def _plain(text: str) -> str:
     """Text that Markdown leaves as it is; what stands between backquotes is code anyway."""
-    parts = text.split("``")
+    parts = re.split(r"(`+[^`]*`+)", text)
     parts[::2] = [re.sub(r"([*_\[\]<])", r"\\\1", part) for part in parts[::2]]
-    return "``".join(parts)
+    return "".join(parts)

@@ -6,13 +6,14 @@ BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 EXTRAS := hardware,viz,train,docs,dev
 
-.PHONY: help demo test test-slow lint format clean
+.PHONY: help demo test test-slow lint docs format clean
 
 help:
 	@echo "make demo       plan and execute the example poses, draw them into out/demo"
-	@echo "make test       lint, type check and the default tests"
+	@echo "make test       lint, type check, the documentation's build and the default tests"
 	@echo "make test-slow  the long tests alone"
 	@echo "make lint       ruff and mypy alone"
+	@echo "make docs       the documentation as a site, in out/site"
 	@echo "make clean      remove .venv and out"
 
 $(STAMP): pyproject.toml constraints.txt
@@ -30,7 +31,11 @@ lint: $(STAMP)
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 
-test: lint
+# Strict: a page that is not in the navigation, a dead link or a wrong docstring is an error.
+docs: $(STAMP)
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
+
+test: lint docs
 	$(BIN)/python -m pytest -m "not slow" -n auto --dist worksteal
 
 test-slow: $(STAMP)

@@ -450,7 +450,7 @@ class RobotConfig(Strict):
 
     @cached_property
     def axial_map(self) -> tuple[tuple[int, ...], ...]:
-        """Tendon number met by servo s at axial position a, [a][s], counting from 1.
+        """Tendon number met by servo s at axial position a, as ``[a][s]``, counting from 1.
 
         The rule (MODEL.md section 4): plug = (a + S s) mod (S J), layer = plug mod S,
         tendon of the layer = plug div S, all counting from 0.

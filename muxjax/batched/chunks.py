@@ -157,7 +157,7 @@ def poses(
 
 
 def tendon_lengths(robot: Robot, bending: Float[np.ndarray, "*batch S 2"]) -> np.ndarray:
-    """Tendon displacements (*batch, S*J) [m] of any number of configurations, in float32.
+    """Tendon displacements ``(*batch, S*J)`` [m] of any number of configurations, in float32.
 
     Raises:
         ValueError: As for ``poses``.

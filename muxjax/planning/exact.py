@@ -65,7 +65,10 @@ def _follow(lattice: Lattice, table: Table) -> tuple[list[Step] | None, str]:
         through = choices.cost + choices.to_go
         best = int(np.argmax(through <= through.min() + _EQUAL))
         if not np.isfinite(through[best]):
-            return None, "every order passes through a state that is not defined"
+            return None, (
+                "every order passes through a state that is not defined, "
+                "or whose cost is not finite"
+            )
         stop = int(choices.stop[best])
         steps.append(Step(stop, choices.moves[best]))
         remaining = remaining - choices.moves[best]

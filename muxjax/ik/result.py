@@ -39,8 +39,8 @@ class IkResult(eqx.Module):
     converged: Bool[Array, "*batch"]
     status: Int[Array, "*batch"]  # IkStatus
     binding_limit: Bool[Array, "*batch S"]  # segments bent to their limit
-    # With a world: least signed distance to obstacles and to the arm itself [m], negative = depth
-    clearance: Float[Array, "*batch"] | None = None
+    clearance: Float[Array, "*batch"] | None = None  # with a world: least signed distance to
+    # obstacles and to the arm itself [m], negative = depth
     nearest_segment: Int[Array, "*batch"] | None = None  # where that is, 1 to S; S + 1 is the tool
     nearest_point: Float[Array, "*batch 3"] | None = None  # on the arm's axis there [m]
 

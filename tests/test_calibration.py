@@ -105,6 +105,7 @@ def test_the_written_file_is_the_fitted_chain(name, tmp_path, rng):
             np.testing.assert_allclose(one, two, rtol=1e-12, atol=1e-13, err_msg=field.name)
 
 
+@pytest.mark.slow
 def test_the_jacobian_agrees_with_finite_differences(setting, rng):
     _, chain, config, parameters, theta, truth = setting
     data = measured(truth, true_offsets(parameters, theta, chain.n_tendons), rng, noise=5.0)

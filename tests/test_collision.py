@@ -212,6 +212,7 @@ def test_large_batches_are_cut_into_equal_answers(muxarm, rng):
 # -- derivatives ---------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_gradients_equal_finite_differences(muxarm, rng, tmp_path):
     items = random_obstacles(rng)
     cloud = {"kind": "points", "points_m": rng.uniform(0.1, 0.3, (20, 3)).tolist()}

@@ -199,6 +199,7 @@ def test_targets_are_new_and_within_the_range(muxarm):
     assert len(np.unique(np.array(states.target)[:, 0])) > 250
 
 
+@pytest.mark.slow
 def test_difficulty_opens_the_range(muxarm):
     env = Tdma(config(theta_rad=(0.2, 1.6), difficulty={"begin": 0.25, "steps": 1000}))
     schedule = env.config.difficulty
@@ -210,6 +211,7 @@ def test_difficulty_opens_the_range(muxarm):
         assert most - 0.05 < theta.max() < most + 1e-3
 
 
+@pytest.mark.slow
 def test_starts_bent_and_axial_positions_are_drawn():
     env = Tdma(config(bent=0.5, axial="random"))
     states = jax.vmap(env.reset)(jax.random.split(jax.random.key(0), 400))
@@ -260,6 +262,7 @@ def test_an_action_that_moves_nothing_still_turns_the_drum(muxarm):
     assert int(nowhere.axial) == 1
 
 
+@pytest.mark.slow
 def test_servos_are_lost_one_by_one_but_never_the_last():
     env = Tdma(config(servo_failure=1.0, servo_sets=[(1, 2, 3)], max_step_mm=2.0))
     states = jax.vmap(env.reset)(jax.random.split(jax.random.key(0), 60))
@@ -326,6 +329,7 @@ def planners_price(env, states, k, action, problem) -> float:
     return float((both[0] + both[1])[0, 1])
 
 
+@pytest.mark.slow
 def test_targets_among_obstacles_are_clear():
     env = Tdma(load_env_config("cabinet"))
     from muxjax.planning.world import clearance_of
@@ -393,6 +397,7 @@ def test_observations_keep_to_their_parts():
     assert (named["prices"] > 0).any(axis=1).all()
 
 
+@pytest.mark.slow
 def test_lookahead_is_the_price_of_each_tendon_alone(muxarm):
     env = Tdma(config(lookahead=True))
     state = env.reset(jax.random.key(5), axial=1, servos=7)

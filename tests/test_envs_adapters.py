@@ -154,6 +154,7 @@ def test_vector_environment_resets_in_the_same_step(rng):
     assert not np.array_equal(final[:, :9], observation[:, :9])
 
 
+@pytest.mark.slow
 def test_lanes_agree_with_single_episodes(muxarm, rng):
     targets = np.stack([random_target(muxarm, rng) for _ in range(4)])
     vector = TdmaVectorEnv(4)
@@ -226,6 +227,7 @@ def one_thread():
     torch.set_num_threads(threads)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("one_thread")
 def test_training_goes_on_and_its_policy_plans(tmp_path, muxarm, rng):
     config = rl_config("muxarm_one_servo", total_steps=128)
@@ -247,6 +249,7 @@ def test_training_goes_on_and_its_policy_plans(tmp_path, muxarm, rng):
     assert run.completed
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("one_thread")
 def test_continuous_training_runs_and_its_policy_fits_no_other_actions(tmp_path, muxarm, rng):
     fit(rl_config("muxarm_continuous", total_steps=128), tmp_path)

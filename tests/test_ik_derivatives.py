@@ -35,6 +35,7 @@ def near(robot, pose: np.ndarray) -> np.ndarray:
     return every.q[int(np.nanargmin(away))]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("axis", range(6))
 def test_by_the_pose(muxarm, axis):
     pose = independent.pose(muxarm, Q)

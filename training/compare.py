@@ -32,7 +32,7 @@ from jaxtyping import Float
 from pydantic import Field
 
 import muxjax
-from muxjax.config import Strict, load_yaml
+from muxjax.config import NotNegative, Positive, Strict, load_yaml
 from muxjax.metrics.statistics import dominated_by, median_interval, spread
 from muxjax.planning import METHODS, Plan, PlanningError, Problem
 from muxjax.planning.beam import WIDEST, Beam
@@ -61,10 +61,11 @@ class CompareConfig(Strict):
         regimes: Kinds of problems; their ``problems`` are how many.
         widths: Plans a level, by what orders and bounds the beam.
         widest: Regimes where no wider beam is tried.
-        not_exact: Regimes whose tables would take the exact planner hours.
         acting: Regimes in which policies act; others they were not trained for.
         baselines: Methods without a search.
-        exact_gib: Memory of the exact planner [GiB]; where it needs more, it is left out.
+        exact_gib: Memory of the exact planner [GiB]; where it needs more, it finds no plan.
+        exact_gib_in: Instead, in regimes whose terms are slow, where a table of that size would
+            take hours; at 0 it is left out.
         pairs: Methods, with their widths, whose costs are compared on the same problems.
     """
 
@@ -75,10 +76,10 @@ class CompareConfig(Strict):
     regimes: tuple[Regime, ...]
     widths: dict[str, tuple[Annotated[int, Field(ge=1)], ...]]
     widest: dict[str, Annotated[int, Field(ge=1)]] = Field(default_factory=dict)
-    not_exact: tuple[str, ...] = ()
     acting: tuple[str, ...] = ()
     baselines: tuple[str, ...]
-    exact_gib: Annotated[float, Field(gt=0)]
+    exact_gib: Positive
+    exact_gib_in: dict[str, NotNegative] = Field(default_factory=dict)
     pairs: tuple[tuple[str, str], ...]
 
 
@@ -160,7 +161,6 @@ def main(options: Options) -> None:
     for regime in config.regimes:
         if options.only and regime.name not in options.only:
             continue
-        widest = config.widest.get(regime.name, WIDEST)
         acting = policies if regime.name in config.acting else {}
         for number, problem in enumerate(problems[regime.name]):
             kept = options.out / f"{regime.name}_{number:03d}.json"
@@ -169,8 +169,7 @@ def main(options: Options) -> None:
                 continue
             found = [
                 record(robot, problem, regime.name, number, *method)
-                for method in methods(config, widest, nets, acting)
-                if not (method[0] == "exact" and regime.name in config.not_exact)
+                for method in methods(config, regime.name, nets, acting)
             ]
             kept.write_text(json.dumps([asdict(r) for r in found]))
             records += found
@@ -205,11 +204,13 @@ Call = Callable[[Lattice], Outcome]
 
 
 def methods(
-    config: CompareConfig, widest: int, nets: dict[str, ValueNet], policies: dict[str, Policy]
+    config: CompareConfig, regime: str, nets: dict[str, ValueNet], policies: dict[str, Policy]
 ) -> Iterator[tuple[str, str, Call]]:
     """Name, network and call of every method of the comparison."""
-    limit = int(config.exact_gib * 2**30)
-    yield "exact", "", partial(_whole, partial(exact, memory_limit=limit))
+    widest = config.widest.get(regime, WIDEST)
+    limit = int(config.exact_gib_in.get(regime, config.exact_gib) * 2**30)
+    if limit:
+        yield "exact", "", partial(_whole, partial(exact, memory_limit=limit))
     for name in config.baselines:
         yield name, "", partial(_whole, METHODS[name])
     for name, widths in config.widths.items():

@@ -260,6 +260,7 @@ def _frame_arm(axes: Any, robot: Robot) -> None:
     axes.set_ylabel("y [mm]", fontsize=8)
     axes.set_zlabel("z [mm]", fontsize=8)
     axes.tick_params(labelsize=7)
+    axes.locator_params(nbins=4)
     axes.view_init(elev=18, azim=-60)
 
 

@@ -22,6 +22,7 @@ from muxjax.cli.bom import bom
 from muxjax.cli.config import config
 from muxjax.cli.demo import demo
 from muxjax.cli.export import export
+from muxjax.cli.figure import figure
 from muxjax.cli.hardware import conformance, firmware
 from muxjax.cli.plans import plan
 from muxjax.cli.poses import fk, ik
@@ -41,6 +42,7 @@ COMMANDS: dict[str, Callable[..., Any]] = {
     "conformance": conformance,
     "demo": demo,
     "export": export,
+    "figure": figure,
     "firmware": firmware,
     "fk": fk,
     "ik": ik,

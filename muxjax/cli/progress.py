@@ -62,6 +62,12 @@ class Reporter:
                 print(f"instruction {progress.instruction} of {total}", file=sys.stderr, flush=True)
 
 
+def work_bar() -> Bar:
+    """A bar for long work, on standard error: standard output holds results alone."""
+    columns = ("{task.description}", BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
+    return Bar(*columns, console=Console(stderr=True), transient=True)
+
+
 def preflight_table(checks: tuple[Check, ...]) -> Table:
     """The preflight report."""
     table = Table("preflight", "", "found")

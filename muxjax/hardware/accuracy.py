@@ -21,6 +21,7 @@ from muxjax.hardware.executor import execute as execute_closed
 from muxjax.hardware.journal import LegEntry, MemoryJournal, ProgramEntry
 from muxjax.hardware.links import LockstepLink
 from muxjax.hardware.physics import PhysicsConfig, load_physics
+from muxjax.hardware.protocol import Frame
 from muxjax.hardware.session import Script
 from muxjax.hardware.visits import Visit, load_visits
 from muxjax.kinematics import segment_ends
@@ -199,7 +200,7 @@ def _execute_open(program: Program, link: LockstepLink) -> Run:
     goals = tuple(tuple(dict(leg) for leg in v.legs) for v in load_visits(link.robot, program))
     journal.write(ProgramEntry(program=program, goals=goals))
     host = OpenLoop(link.robot, journal, link.new_session(), link.stream_divider)
-    frames = []
+    frames: list[Frame] = []
     while not host.finished:
         link.send(host.step(link.now, frames))
         frames = link.wait(host.next_time)

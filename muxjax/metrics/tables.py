@@ -1,4 +1,4 @@
-"""The tables of the MuxArm paper as text, beside what follows from this model (M Tables I to III)."""
+"""The MuxArm paper's Tables I to III as text, beside what follows from this model."""
 
 from __future__ import annotations
 
@@ -59,18 +59,18 @@ def table1(robot: Robot) -> TextTable:
     Args:
         robot: The arm of the last row.
     """
-    worm = robot.config.drive_strength.worm_efficiency.value
+    drive = robot.config.drive_strength
+    worm = None if drive is None else drive.worm_efficiency.value
     clutch = robot.config.clutch.engage_time_s.value
-    torque = robot.config.servo.stall_torque_nm.value * float(robot.gear_ratio) * worm
+    stall = robot.config.servo.stall_torque_nm.value * float(robot.gear_ratio)
     alone = sum(
-        bool(robot.reach((s,)).any(axis=0).all())
-        for s in range(1, robot.tendons_per_segment + 1)
+        bool(robot.reach((s,)).any(axis=0).all()) for s in range(1, robot.tendons_per_segment + 1)
     )
     model = (
         f"{robot.config.name}, this model",
-        "yes" if worm < 0.5 else "no",
+        "-" if worm is None else "yes" if worm < 0.5 else "no",
         f"{clutch:g} s, {float(robot.switch_time):g} s with a turn",
-        f"{torque:.0f} N m",
+        "-" if worm is None else f"{stall * worm:.0f} N m",
         f"{robot.tendons_per_segment + 1} motors, {robot.n_tendons} tendons",
         "-",
         f"{alone} of {robot.tendons_per_segment} servos reach all",
@@ -113,8 +113,8 @@ def table2(protocol: Protocol, found: Comparison) -> TextTable:
         by_name = {row.setting: row for row in found.rows if row.servos == servos}
         columns: list[list[str]] = []
         printed_of = [c for c in protocol.published if c.servos == servos]
-        for name, printed in zip(theirs, printed_of, strict=True):
-            columns += [_rerun(by_name[name]), _printed(printed)]
+        for name, column in zip(theirs, printed_of, strict=True):
+            columns += [_rerun(by_name[name]), _printed(column)]
         columns += [_rerun(by_name[name]) for name in ours]
         labels = _labels(len(found.rows[0].overshoot_duration))
         rules.append(len(rows))

@@ -44,7 +44,7 @@ def trials_figure(trials: Mapping[int, Trial], case: str) -> Figure:
     with mpl.rc_context(STYLE):
         figure = Figure(figsize=(9.2, 4.6), layout="constrained")
         figure.suptitle(f"To a target and back: {case}")
-        left, right = figure.subfigures(1, 2, width_ratios=[1.1, 1.7])
+        left, right = figure.subfigures(1, 2, squeeze=False, width_ratios=[1.1, 1.7])[0]
         space = left.add_subplot(projection="3d")
         _draw_space(space, trials)
         panels = right.subplots(3, 2, sharex=True)
@@ -157,7 +157,7 @@ def workspace_figure(sweep: Sweep, points: Sequence[SamplePoint], about: str) ->
     """
     with mpl.rc_context(STYLE):
         figure = Figure(figsize=(9.2, 4.4), layout="constrained")
-        plane, bars = figure.subfigures(1, 2, width_ratios=[1.35, 1])
+        plane, bars = figure.subfigures(1, 2, squeeze=False, width_ratios=[1.35, 1])[0]
         axes = plane.subplots()
         axes.grid(False)
         draw_dexterity(plane, axes, sweep)

@@ -84,7 +84,7 @@ def _programs_figure(
     bands = -(-len(programs) // columns)
     figure = Figure(figsize=(1.75 * columns + 2.6, 3.3 * bands + 0.6), layout="constrained")
     figure.suptitle(title)
-    left, right = figure.subfigures(1, 2, width_ratios=[2.4, 1.75 * columns])
+    left, right = figure.subfigures(1, 2, squeeze=False, width_ratios=[2.4, 1.75 * columns])[0]
     arm = left.add_subplot(projection="3d")
     first = next(iter(programs.values()))
     draw_arm(arm, robot, np.array(first.start), alpha=0.35)

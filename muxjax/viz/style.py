@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +17,7 @@ INK, GREY = "#1f2933", "0.55"
 
 # Sizes of a printed column; text stays text in vector files, for editors and for search. The salt
 # and the missing date make the same figure the same file.
-STYLE: dict[str, Any] = {
+STYLE: Any = {
     "font.size": 8,
     "axes.titlesize": 8,
     "axes.labelsize": 8,
@@ -64,4 +65,25 @@ def save_figure(figure: Figure, path: str | Path, *, dpi: int = 200) -> Path:
     path.parent.mkdir(parents=True, exist_ok=True)
     with mpl.rc_context(STYLE), replacing(path) as part:
         figure.savefig(part, dpi=dpi, format=path.suffix[1:], metadata=_DATELESS.get(path.suffix))
+    return path
+
+
+def save_small(figure: Figure, path: str | Path, *, width: int = 1000, shades: int = 96) -> Path:
+    """Write a figure as a small .png, for a web page.
+
+    Args:
+        figure: The figure.
+        path: File to write.
+        width: In pixels.
+        shades: Colours of its palette.
+    """
+    from PIL import Image
+
+    path = Path(path)
+    whole = io.BytesIO()
+    with mpl.rc_context(STYLE):
+        figure.savefig(whole, dpi=width / figure.get_size_inches()[0], format="png")
+    picture = Image.open(whole).convert("RGB").quantize(shades, dither=Image.Dither.NONE)
+    with replacing(path) as part:
+        picture.save(part, format="PNG", optimize=True)
     return path

@@ -102,14 +102,14 @@ def _write(
         for number, line in enumerate(name.split("\n")):
             put(x, y - number * _LINE, line)
     y -= head * _LINE
-    rule(y + 0.15 * _LINE, 0.7)
+    rule(y + 0.08 * _LINE, 0.7)
     for number, row in enumerate(table.rows):
         if number in table.rules:
-            rule(y + 0.15 * _LINE, 0.5)
+            rule(y + 0.08 * _LINE, 0.5)
         for x, text in zip(lefts, row, strict=True):
             put(x, y, text)
         y -= _LINE
-    rule(y + 0.15 * _LINE, 1.2)
+    rule(y + 0.08 * _LINE, 1.2)
     y -= 0.1 * _LINE
     for line in notes:
         put(_PAD, y, line, fontsize=6.5)

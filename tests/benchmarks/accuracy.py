@@ -37,9 +37,7 @@ def summary(trials: list[Trial], tip: int) -> list[str]:
     """At the target and over the whole motion, tip; at the target, each section's end."""
     every = [trial.errors() for trial in trials]
     whole = [np.concatenate([errors[k][:, tip] for errors in every]) for k in (0, 1)]
-    at = [
-        np.array([e[k][t.at_target] for e, t in zip(every, trials, strict=True)]) for k in (0, 1)
-    ]
+    at = [np.array([e[k][t.at_target] for e, t in zip(every, trials, strict=True)]) for k in (0, 1)]
     cells = [cell(at[0][:, tip], at[1][:, tip]), cell(*whole)]
     return cells + [cell(at[0][:, section], at[1][:, section]) for section in range(tip)]
 

@@ -65,7 +65,8 @@ class Reporter:
 def work_bar() -> Bar:
     """A bar for long work, on standard error: standard output holds results alone."""
     columns = ("{task.description}", BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
-    return Bar(*columns, console=Console(stderr=True), transient=True)
+    console = Console(stderr=True)
+    return Bar(*columns, console=console, transient=True, disable=not console.is_terminal)
 
 
 def preflight_table(checks: tuple[Check, ...]) -> Table:

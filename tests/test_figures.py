@@ -99,11 +99,13 @@ def programs(robot):
 # -- Fig. 6 ---------------------------------------------------------------------------------------
 
 
-def test_lengths_and_angles_drawn_are_the_programs(robot, programs):
-    figure = drawn(programs_figure(robot, programs, "title", letters="abc"))
+@pytest.mark.parametrize("order", [1, -1])  # panels share scales: the largest may come last
+def test_lengths_and_angles_drawn_are_the_programs(robot, programs, order):
+    chosen = dict([*programs.items()][::order])
+    figure = drawn(programs_figure(robot, chosen, "title", letters="abc"))
     _, *panels = figure.axes
     assert len(panels) == 4
-    for number, program in enumerate(programs.values()):
+    for number, program in enumerate(chosen.values()):
         lengths, angles = panels[2 * number : 2 * number + 2]
         line = timeline(robot, program)
         assert len(lengths.lines) == robot.n_tendons
@@ -118,6 +120,14 @@ def test_lengths_and_angles_drawn_are_the_programs(robot, programs):
             np.testing.assert_allclose(theta, expected, atol=1e-6)
             final = angles.lines[2 * i + 1].get_ydata()
             np.testing.assert_allclose(final, theta[-1])
+        for axes in (lengths, angles):
+            (left, low), (right, high) = axes.viewLim.get_points()
+            for artist in axes.lines:
+                x, y = artist.get_data()
+                assert low <= np.min(y)  # nothing is cut off
+                assert np.max(y) <= high
+                assert left <= np.min(x)
+                assert np.max(x) <= right
     assert axes_without_units(figure) == []
 
 
@@ -384,7 +394,7 @@ def test_a_folder_that_is_no_training_is_refused(tmp_path, text):
 
 def test_the_unit_check_can_fail(robot, programs):
     figure = programs_figure(robot, programs, "title")
-    figure.axes[1].set_ylabel("tendon displacement")
+    figure.axes[1].set_ylabel("displacement")
     assert len(axes_without_units(drawn(figure))) == 1
 
 

@@ -82,9 +82,9 @@ def _programs_figure(
     letters = letters or [""] * (len(programs) + 1)
     columns = min(len(programs), _PANELS_A_ROW)
     bands = -(-len(programs) // columns)
-    figure = Figure(figsize=(1.75 * columns + 2.6, 3.3 * bands + 0.6), layout="constrained")
+    figure = Figure(figsize=(1.75 * columns + 3.0, 3.3 * bands + 0.6), layout="constrained")
     figure.suptitle(title)
-    left, right = figure.subfigures(1, 2, squeeze=False, width_ratios=[2.4, 1.75 * columns])[0]
+    left, right = figure.subfigures(1, 2, squeeze=False, width_ratios=[2.8, 1.75 * columns])[0]
     arm = left.add_subplot(projection="3d")
     first = next(iter(programs.values()))
     draw_arm(arm, robot, np.array(first.start), alpha=0.35)
@@ -113,8 +113,10 @@ def _programs_figure(
         lengths.tick_params(labelbottom=False)
         angles.set_xlabel("time [s]")
         if column == 0:
-            lengths.set_ylabel("tendon displacement [mm]")
+            lengths.set_ylabel("displacement [mm]")
             angles.set_ylabel("bending angle [deg]")
+    # Of all panels, which share their scales: a limit before the last one would cut those after it.
+    top[1].set_ylim(0, top[1].get_ylim()[1])
     figure.legend(*_legend(robot), loc="outside lower center", ncols=7)
     return figure
 
@@ -138,7 +140,6 @@ def _draw_angles(axes: Any, robot: Robot, line: Trajectory) -> None:
         axes.plot(times, values, color=colour(segment), lw=1.2, marker=marker(segment), ms=3,
                   markevery=every)  # fmt: skip
         axes.axhline(values[-1], color=colour(segment), ls=":", lw=0.9)
-    axes.set_ylim(bottom=0)
 
 
 def _shade_motion(axes: Any, line: Trajectory) -> None:

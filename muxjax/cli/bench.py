@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import sys
 import time
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -12,7 +11,7 @@ import tyro
 from rich import box
 from rich.table import Column, Table
 
-from muxjax.cli.output import console, print_json
+from muxjax.cli.output import complain, console, print_json
 from muxjax.cli.progress import work_bar
 from muxjax.config import load_yaml, resolve
 from muxjax.metrics.protocol import Protocol, Published
@@ -172,6 +171,6 @@ def _plots() -> Any:
     try:
         from muxjax.metrics import plots
     except ImportError:
-        print("muxjax: no plots: they need matplotlib, pip install 'muxjax[viz]'", file=sys.stderr)
+        complain("no plots: they need matplotlib, pip install 'muxjax[viz]'")
         return None
     return plots

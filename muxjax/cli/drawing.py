@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from muxjax.cli.output import configuration_argument
 from muxjax.config import data_folder, load_yaml, resolve
 from muxjax.hardware.accuracy import (
     CASES,
@@ -85,7 +86,7 @@ def draw_fig6(
     if q_deg is None:
         goal, name = rules.target(arm, seed, target), f"target {target} of seed {seed}"
     else:
-        q = check_configuration(arm, np.radians(np.asarray(q_deg)))
+        q = configuration_argument(arm, "--q-deg", q_deg)
         goal, name = np.asarray(tendon_displacements(arm, q)), "bending and azimuth as given"
     panels = []
     for panel in case_study(arm, rules, goal):

@@ -311,7 +311,7 @@ def _need_matplotlib() -> None:
         raise ValueError("figures need matplotlib: pip install 'muxjax[viz]'")
 
 
-_COMMANDS: dict[str, Any] = {
+COMMANDS: dict[str, Any] = {
     "fig6": fig6,
     "fig7": fig7,
     "fig8c": fig8c,
@@ -322,10 +322,13 @@ _COMMANDS: dict[str, Any] = {
     "table3": table3,
     "training": training,
 }
-_Choice: Any = choice_of(_COMMANDS)
+_Choice: Any = choice_of(COMMANDS)
 
 
 def figure(command: tyro.conf.OmitArgPrefixes[_Choice]) -> int:
-    """Figures and tables of the MuxArm paper from this model, as PDF, SVG or PNG; the gallery."""
+    """Figures and tables of the MuxArm paper from this model, as PDF, SVG or PNG; the gallery.
+
+    Example: muxjax figure fig6 --out fig6.pdf
+    """
     code: int = command
     return code

@@ -6,6 +6,7 @@ import csv
 import io
 import json
 import re
+from pathlib import Path
 from typing import get_args
 
 import numpy as np
@@ -504,3 +505,14 @@ def test_panels_state_what_their_program_takes(robot, programs):
     figure = programs_figure(robot, {panel.name: panel.program}, "t", letters="ab")
     title = figure.axes[1].get_title()
     assert title == f"(b) greedy\n{metrics.time_s:.1f} s, {metrics.stages} stages"
+
+
+def test_the_page_shows_every_picture_of_the_gallery_and_they_are_small():
+    docs = Path(__file__).resolve().parent.parent / "docs"
+    shown = re.findall(
+        r"!\[[^\]]+\]\(images/(gallery_\w+\.png)\)", (docs / "figures.md").read_text()
+    )
+    there = sorted(path.name for path in (docs / "images").glob("gallery_*.png"))
+    assert sorted(shown) == there
+    assert len(there) == 8
+    assert all((docs / "images" / name).stat().st_size < 150_000 for name in there)

@@ -10,7 +10,7 @@ import tyro
 from rich import box
 from rich.table import Table
 
-from muxjax.cli.output import choice_of, complain, console, print_json
+from muxjax.cli.output import choice_of, complain, console, print_json, verdict
 from muxjax.config import ConfigError
 from muxjax.schemas import KINDS, check_file, json_schema, schema_line
 
@@ -91,7 +91,8 @@ def check(files: Annotated[tuple[Path, ...], tyro.conf.Positional], json: bool =
     else:
         for item in findings:
             if item["error"] is None:
-                console.print(f"{item['file']}: {item['kind']}, as it should be", soft_wrap=True)
+                said = verdict(f"{item['file']}: {item['kind']}, as it should be", True)
+                console.print(said, soft_wrap=True)
             else:
                 complain(item["error"])
     return 2 if wrong else 0

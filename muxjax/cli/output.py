@@ -48,10 +48,16 @@ def notice(text: str) -> None:
 
 
 def complain(text: object, advice: str = "") -> None:
-    """Say on standard error what is wrong, and what to do about it."""
-    errors.print(Text.assemble(("muxjax: ", "bad"), str(text)), soft_wrap=True)
-    if advice:
-        errors.print(Text(f"        {advice}", "aside"), soft_wrap=True)
+    """Say on standard error, in one line, what is wrong and what to do about it.
+
+    Args:
+        text: What is wrong; it may name a command to call, and then says enough.
+        advice: What to do otherwise.
+    """
+    said = Text.assemble(("muxjax: ", "bad"), str(text))
+    if advice and "muxjax " not in str(text):
+        said += Text(f" ({advice})", "aside")
+    errors.print(said, soft_wrap=True)
 
 
 def verdict(text: str, good: bool) -> Text:

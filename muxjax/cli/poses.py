@@ -153,7 +153,7 @@ def _solve_and_report(
         found = all_ik(arm, target, project_rotations=project_rotations)
         clear = None if obstacles is None else _clearances(arm, found, obstacles)
         return _report_all(arm, found, clear, json, many=poses is not None)
-    near = None if not q0_deg else np.radians(q0_deg)
+    near = configuration_argument(arm, "--q0-deg", q0_deg) if q0_deg else None
     one = solve_ik(
         arm,
         target,
@@ -255,6 +255,8 @@ def _report_one(arm: Robot, found: IkResult, json: bool) -> int:
         f"position error {1e3 * found.position_error:.3g} mm, "
         f"orientation error {np.degrees(found.orientation_error):.3g} deg"
     )
+    if not reached:
+        console.print("muxjax sweep draws where the arm reaches", style="aside")
     if found.clearance is not None:
         console.print(
             f"clearance {1e3 * float(found.clearance):.1f} mm, least at segment "

@@ -82,7 +82,8 @@ def fig7(
     Args:
         out: File to write: .pdf or .svg (vector), or .png.
         case: What slips and who looks (docs/accuracy.md).
-        trials: Random targets, as many runs for each number of servos.
+        trials: Random targets, as many runs for each number of servos; another number draws
+            other targets.
         robot: Shipped robot or path of a YAML file.
         json: Print the figure's numbers as JSON in SI units.
     """

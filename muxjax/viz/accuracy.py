@@ -63,7 +63,9 @@ def _draw_space(axes: Any, trials: Mapping[int, Trial]) -> None:
     for number, trial in enumerate(trials.values()):
         tool = 1e3 * trial.poses[:, -1, :3, 3]
         for part, style in _ways(trial):
-            axes.plot(*tool[part].T, style, color=_colour(number), lw=1.0)
+            own = tool[part]
+            axes.plot(*own.T, style, color=_colour(number), lw=1.0, marker=MARKERS[number], ms=3,
+                      markevery=max(1, len(own) // 5))  # fmt: skip
         axes.plot(*tool[[trial.at_target]].T, MARKERS[number], color=_colour(number), ms=5)
     wanted = next(iter(trials.values()))
     axes.plot(*1e3 * wanted.planned[[wanted.at_target], -1, :3, 3].T, "x", color=INK, ms=8)

@@ -7,7 +7,7 @@ from typing import Literal
 
 from pydantic import Field
 
-from muxjax.config import Strict, load_json, save_json
+from muxjax.config import ConfigError, Strict, load_json, save_json
 from muxjax.scheduler import Program
 
 
@@ -29,4 +29,7 @@ def load_program(path: str | Path) -> Program:
     Raises:
         ConfigError: No such file, not JSON, another schema or a wrong field; each named.
     """
-    return load_json(ProgramFile, path).program
+    try:
+        return load_json(ProgramFile, path).program
+    except ConfigError as error:
+        raise ConfigError(f"{error}; muxjax plan --out writes programs") from error

@@ -43,7 +43,11 @@ def urdf_joints(robot: Robot, per_segment: int) -> tuple[str, ...]:
 
 
 def urdf_joint_angles(
-    robot: Robot, q: Float[np.ndarray, "*batch dof"], per_segment: int
+    robot: Robot,
+    q: Float[np.ndarray, "*batch dof"],
+    per_segment: int,
+    *,
+    within_limits: bool = True,
 ) -> Float[np.ndarray, "*batch joints"]:
     """Angles [rad] of the joints of ``urdf_joints``, in its order, for configurations.
 
@@ -56,12 +60,14 @@ def urdf_joint_angles(
         robot: The arm.
         q: (theta_1, phi_1, ...) [rad], any leading batch axes.
         per_segment: Parts a segment, as of the URDF.
+        within_limits: Refuse bending beyond a segment's limit. A motion passes such shapes, as
+            nothing keeps it within the limits between its ends.
 
     Raises:
         ValueError: See ``urdf``; or a configuration of wrong shape, not finite, or beyond a limit.
     """
     _check(robot, per_segment)
-    checked = check_configuration(robot, q)
+    checked = check_configuration(robot, q) if within_limits else np.asarray(q, dtype=np.float64)
     part, phi = checked[..., 0::2] / per_segment, checked[..., 1::2]
     x, y, z = np.sin(part) * np.cos(phi), np.sin(part) * np.sin(phi), np.cos(part)
     x_first = np.stack([np.arctan2(-y, z), np.arcsin(x)], axis=-1)

@@ -196,7 +196,7 @@ def test_bad_pose_files_name_the_row(muxjax, tmp_path, name, text, message):
         (["--matrix", *MATRIX, "--quat", "1", "0", "0", "0"], "go with --xyz-mm"),
         (["--xyz-mm", "0", "0", "400", "--all", "--prefer", "bending"], "leave out --q0-deg"),
         (["--xyz-mm", "0", "0", "400", "--prefer", "clearance"], "'clearance' needs a world"),
-        (["--xyz-mm", "0", "0", "400", "--q0-deg", "1"], "q0: last axis must have 6"),
+        (["--xyz-mm", "0", "0", "400", "--q0-deg", "1"], "--q0-deg: muxarm has 3 segments; give 6"),
     ],
 )
 def test_bad_ik_arguments_are_errors_of_one_line(muxjax, arguments, message):
@@ -276,7 +276,7 @@ def test_a_bus_that_cannot_be_opened_comes_after_the_rehearsal(muxjax, tmp_path,
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["fk", "60", "0"], "q: last axis must have 6"),
+        (["fk", "60", "0"], "fk: muxarm has 3 segments; give 6 numbers"),
         (["fk", "nan", "0", "0", "0", "0", "0"], "is nan, must be finite"),
         (["fk", "200", "0", "0", "0", "0", "0"], "bending of segment 1 is 200 degrees, limit 180"),
         (["fk", "1", "2", "--robot", "nobody"], "no 'nobody' among the shipped files"),

@@ -15,7 +15,12 @@ from muxjax.cli import COMMANDS, main
 DOC = (Path(__file__).resolve().parent.parent / "docs" / "command_line.md").read_text()
 EXAMPLES = dict(re.findall(r"^\| `(\w+)` \|.*\| `(muxjax .*)` \|$", DOC, re.MULTILINE))
 # Commands of commands: the help that lists options is one word further.
-NESTED = {"config": ["schema", "check"], "statics": ["posture", "calibrate", "experiment"]}
+FIGURES = ["fig6", "fig7", "fig8c", "gallery", "statics", "table1", "table2", "table3", "training"]
+NESTED = {
+    "config": ["schema", "check"],
+    "figure": FIGURES,
+    "statics": ["posture", "calibrate", "experiment"],
+}
 
 
 @pytest.fixture

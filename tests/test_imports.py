@@ -13,7 +13,7 @@ import pytest
 import muxjax
 
 # Heavy or optional: only the rooms that need them may import them, and only when used.
-OPTIONAL = ["torch", "gymnasium", "stable_baselines3", "can", "cantools", "matplotlib"]
+OPTIONAL = ["torch", "gymnasium", "stable_baselines3", "can", "cantools", "matplotlib", "mcap"]
 
 # ARCHITECTURE.md: nothing points back. A room imports rooms of earlier rows, and of its own row
 # only itself (planning and hardware have rooms inside).
@@ -28,7 +28,7 @@ ORDER = [
     {"workspace", "planning"},
     {"ik", "scheduler"},
     {"metrics", "hardware", "program_file", "plan_file", "trajectory_file"},
-    {"pipeline", "viz", "schemas"},
+    {"pipeline", "recording", "viz", "schemas"},
     {"cli"},
     {"__init__", "__main__"},
 ]

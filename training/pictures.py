@@ -1,7 +1,6 @@
-"""Pictures of trainings and of the comparison.
+"""The picture of the comparison: python -m training.pictures --records out/compare --out front.png.
 
-python -m training.pictures curves --runs out/rl/one_servo_0 out/rl/one_servo_1 --out curve.png
-python -m training.pictures front --records out/compare --out front.png
+`muxjax figure training` draws learning curves.
 """
 
 from __future__ import annotations
@@ -11,13 +10,12 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import tyro
 from matplotlib.figure import Figure
 from matplotlib.ticker import NullFormatter
 
 from muxjax.config import ConfigError
-from training.compare import Record, front, medians, trained_in
+from training.compare import Record, front, medians
 
 # By what orders the beam; shades and marks that are apart in grey, too.
 _STYLES = {
@@ -27,41 +25,6 @@ _STYLES = {
     "count": ("tab:green", "^"),
     "none": ("tab:gray", "v"),
 }
-
-
-def curves(runs: tuple[Path, ...], out: Path = Path("out/curves.png")) -> int:
-    """Median gap and solved share of policies over environment steps, a line a training.
-
-    Args:
-        runs: Folders of ``training.train_rl``; those whose names differ only after the last
-            underscore share their colour.
-        out: Picture to write.
-    """
-    figure = Figure(figsize=(7.0, 4.6), layout="constrained")
-    axes: Any = figure.subplots(2, 1, sharex=True, height_ratios=(3, 1))
-    names: list[str] = []
-    for run in runs:
-        lines, name = _curve(run), trained_in(run)
-        first = name not in names
-        names += [name] * first
-        shade = f"C{names.index(name)}"
-        steps = 1e-6 * np.array([line["steps"] for line in lines])
-        low, middle, high = (
-            100 * np.array([line[key] for line in lines])
-            for key in ("lower_quartile", "median_gap", "upper_quartile")
-        )
-        axes[0].fill_between(steps, low, high, color=shade, alpha=0.12, linewidth=0)
-        axes[0].plot(steps, middle, color=shade, label=name if first else None)
-        axes[1].plot(steps, [100 * (1 - line["solved"]) for line in lines], color=shade)
-    axes[0].set(ylabel="over the optimum [%]", yscale="log")
-    axes[0].yaxis.set_major_formatter("{x:g}")
-    axes[0].legend(title="median; bands: quartiles")
-    axes[1].set(ylabel="unsolved [%]", xlabel="environment steps [million]")
-    axes[1].set_yscale("symlog", linthresh=0.5)
-    axes[1].set(ylim=(-0.1, 110), yticks=(0, 1, 10, 100), yticklabels=("0", "1", "10", "100"))
-    for each in axes:
-        each.grid(alpha=0.3)
-    return _written(figure, out)
 
 
 def picture_of_front(records: tuple[Path, ...], out: Path = Path("out/front.png")) -> int:
@@ -118,13 +81,6 @@ def _draw_front(panel: Any, records: Sequence[Record]) -> None:
     panel.grid(alpha=0.3)
 
 
-def _curve(run: Path) -> list[dict[str, float]]:
-    try:
-        return list(json.loads((run / "curve.json").read_text()))
-    except (OSError, ValueError) as error:
-        raise ConfigError(f"{run}: is no training of a policy ({error})") from None
-
-
 def _written(figure: Figure, out: Path) -> int:
     out.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(out, dpi=160)
@@ -133,4 +89,4 @@ def _written(figure: Figure, out: Path) -> int:
 
 
 if __name__ == "__main__":
-    tyro.extras.subcommand_cli_from_dict({"curves": curves, "front": picture_of_front})
+    tyro.cli(picture_of_front)

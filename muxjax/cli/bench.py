@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 import dataclasses
-import sys
 import time
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import tyro
 from rich import box
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TimeElapsedColumn
 from rich.table import Column, Table
 
-from muxjax.cli.output import console, print_json
+from muxjax.cli.output import complain, console, print_json
+from muxjax.cli.progress import work_bar
 from muxjax.config import load_yaml, resolve
 from muxjax.metrics.protocol import Protocol, Published
 from muxjax.metrics.report import cell, csv_text, interval, markdown
@@ -49,7 +48,7 @@ def bench(
     if out is not None:
         out.mkdir(parents=True, exist_ok=True)
     kept = None if out is None else out / "targets.jsonl"
-    with _progress() as bar:
+    with work_bar() as bar:
         task = bar.add_task(which, total=targets)
         records = run_table(
             robot,
@@ -70,14 +69,6 @@ def bench(
         if not json:
             console.print(f"written to {out}: {', '.join(p.name for p in written)}")
     return 0
-
-
-def _progress() -> Progress:
-    """On standard error, so that standard output holds results alone."""
-    from rich.console import Console
-
-    columns = ("{task.description}", BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
-    return Progress(*columns, console=Console(stderr=True), transient=True)
 
 
 def _print(rules: Protocol, found: Comparison) -> None:
@@ -180,6 +171,6 @@ def _plots() -> Any:
     try:
         from muxjax.metrics import plots
     except ImportError:
-        print("muxjax: no plots: they need matplotlib, pip install 'muxjax[viz]'", file=sys.stderr)
+        complain("no plots: they need matplotlib, pip install 'muxjax[viz]'")
         return None
     return plots

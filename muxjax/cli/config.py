@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json as json_text
-import sys
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -11,7 +10,7 @@ import tyro
 from rich import box
 from rich.table import Table
 
-from muxjax.cli.output import choice_of, console, print_json
+from muxjax.cli.output import choice_of, complain, console, print_json, verdict
 from muxjax.config import ConfigError
 from muxjax.schemas import KINDS, check_file, json_schema, schema_line
 
@@ -54,7 +53,7 @@ def _all() -> dict[str, dict[str, Any]]:
         try:
             found[kind] = json_schema(kind)
         except ConfigError as error:
-            print(f"muxjax: left out: {error}", file=sys.stderr)
+            complain(f"left out: {error}")
     return found
 
 
@@ -92,17 +91,21 @@ def check(files: Annotated[tuple[Path, ...], tyro.conf.Positional], json: bool =
     else:
         for item in findings:
             if item["error"] is None:
-                console.print(f"{item['file']}: {item['kind']}, as it should be", soft_wrap=True)
+                said = verdict(f"{item['file']}: {item['kind']}, as it should be", True)
+                console.print(said, soft_wrap=True)
             else:
-                print(f"muxjax: {item['error']}", file=sys.stderr)
+                complain(item["error"])
     return 2 if wrong else 0
 
 
-_COMMANDS: dict[str, Any] = {"schema": schema, "check": check}
-_Choice: Any = choice_of(_COMMANDS)
+COMMANDS: dict[str, Any] = {"schema": schema, "check": check}
+_Choice: Any = choice_of(COMMANDS)
 
 
 def config(command: tyro.conf.OmitArgPrefixes[_Choice]) -> int:
-    """What YAML files may say: their JSON schemas, and checks of files."""
+    """What YAML files may say: their JSON schemas, and checks of files.
+
+    Example: muxjax config check my_arm.yaml
+    """
     code: int = command
     return code

@@ -7,6 +7,8 @@ import dataclasses
 from collections.abc import Iterator
 from pathlib import Path
 
+from rich.text import Text
+
 from muxjax.cli.output import console, print_json
 from muxjax.hardware import BusLink, Link, LockstepLink, load_physics
 from muxjax.hardware.conformance import Finding, run_checks
@@ -91,7 +93,9 @@ def conformance(
 
 
 def _print_finding(finding: Finding) -> None:
-    console.print(f"{finding.verdict:8} {finding.name}  {finding.reason}".rstrip(), soft_wrap=True)
+    look = {"pass": "good", "fail": "bad"}.get(finding.verdict, "aside")
+    said = Text(f"{finding.verdict:8}", look) + f" {finding.name}  {finding.reason}".rstrip()
+    console.print(said, soft_wrap=True)
 
 
 @contextlib.contextmanager

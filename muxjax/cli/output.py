@@ -4,19 +4,33 @@ from __future__ import annotations
 
 import json
 import math
-import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Annotated, Any, Union
 
 import numpy as np
 import scipy
 import tyro
 from rich.console import Console
+from rich.text import Text
+from rich.theme import Theme
 
-# Units stand in square brackets, which would otherwise be taken for markup.
-console = Console(markup=False, highlight=False)
-if not console.is_terminal:
-    console.width = 120  # a file or a pipe has no width; the default of 80 would break the tables
+from muxjax.kinematics import check_configuration
+from muxjax.robot import Robot
+
+# rich leaves colours out where the output is no terminal, and where NO_COLOR is set.
+_THEME = Theme({"table.header": "bold cyan", "good": "green", "bad": "bold red", "aside": "dim"})
+
+
+def make_console(*, stderr: bool = False) -> Console:
+    """A console of the command line, to standard output or to standard error."""
+    # Units stand in square brackets, which would otherwise be taken for markup.
+    made = Console(stderr=stderr, theme=_THEME, markup=False, highlight=False, emoji=False)
+    if not made.is_terminal:
+        made.width = 120  # a file or a pipe has no width; the default of 80 would break the tables
+    return made
+
+
+console, errors = make_console(), make_console(stderr=True)
 
 
 def choice_of(commands: Mapping[str, Callable[..., Any]]) -> Any:
@@ -30,7 +44,40 @@ def choice_of(commands: Mapping[str, Callable[..., Any]]) -> Any:
 
 def notice(text: str) -> None:
     """Say something that is not the result: standard output may be JSON for a machine."""
-    print(text, file=sys.stderr, flush=True)
+    errors.print(text, soft_wrap=True)
+
+
+def complain(text: object, advice: str = "") -> None:
+    """Say on standard error, in one line, what is wrong and what to do about it.
+
+    Args:
+        text: What is wrong; it may name a command to call, and then says enough.
+        advice: What to do otherwise.
+    """
+    said = Text.assemble(("muxjax: ", "bad"), str(text))
+    if advice and "muxjax " not in str(text):
+        said += Text(f" ({advice})", "aside")
+    errors.print(said, soft_wrap=True)
+
+
+def verdict(text: str, good: bool) -> Text:
+    """A word in the colour of good or bad news; the word alone says it, too."""
+    return Text(text, "good" if good else "bad")
+
+
+def configuration_argument(robot: Robot, option: str, q_deg: Sequence[float]) -> np.ndarray:
+    """A configuration [rad] typed as bending angle and azimuth of each segment [degrees].
+
+    Raises:
+        ValueError: Another count of numbers, or bending beyond a segment's limit.
+    """
+    count = 2 * robot.n_segments
+    if len(q_deg) != count:
+        raise ValueError(
+            f"{option}: {robot.config.name} has {robot.n_segments} segments; give {count} numbers, "
+            f"bending angle and azimuth of each [degrees], found {len(q_deg)}"
+        )
+    return check_configuration(robot, np.radians(np.asarray(q_deg, dtype=float)))
 
 
 def print_json(document: Any) -> None:

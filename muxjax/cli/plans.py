@@ -10,11 +10,10 @@ from typing import Any, Literal
 import numpy as np
 from rich.table import Table
 
-from muxjax.cli.output import console, print_json, row_of
+from muxjax.cli.output import configuration_argument, console, print_json, row_of
 from muxjax.cli.poses import Quaternion, Xyz, pose_argument
 from muxjax.collision import load_world
 from muxjax.config import TaskConfig, load_yaml, resolve
-from muxjax.kinematics import check_configuration
 from muxjax.metrics import evaluate
 from muxjax.pipeline import PathPlan, PosePlan, plan_task, plan_to_pose
 from muxjax.plan_file import save_plan as write_plan
@@ -94,7 +93,8 @@ def plan_to_configuration(
     arm: Robot, q_deg: tuple[float, ...] | None, method: Method, fields: dict[str, Any]
 ) -> Plan:
     """Plan from the straight arm to a configuration [degrees]."""
-    q = check_configuration(arm, np.radians(np.asarray(q_deg)))
+    assert q_deg is not None  # the callers have seen to it
+    q = configuration_argument(arm, "--q-deg", q_deg)
     problem = Problem(np.zeros(arm.n_tendons), tendon_displacements(arm, q), **fields)
     return plan_steps(arm, problem, method)
 

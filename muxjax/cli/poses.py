@@ -12,12 +12,19 @@ import tyro
 from pydantic import ValidationError
 from rich.table import Table
 
-from muxjax.cli.output import console, pose_document, print_json, row_of
+from muxjax.cli.output import (
+    configuration_argument,
+    console,
+    pose_document,
+    print_json,
+    row_of,
+    verdict,
+)
 from muxjax.cli.pose_input import matrix_from, read_poses
 from muxjax.collision import World, load_world, tightest
 from muxjax.config import ConfigError, TargetConfig, explain
 from muxjax.ik import AllIkResult, IkResult, IkStatus, all_ik, solve_ik
-from muxjax.kinematics import check_configuration, forward_kinematics
+from muxjax.kinematics import forward_kinematics
 from muxjax.pipeline import target_pose
 from muxjax.robot import Robot, load_robot
 from muxjax.tendons import tendon_displacements
@@ -41,7 +48,7 @@ def fk(
         json: Print JSON in SI units.
     """
     arm = load_robot(robot)
-    q = check_configuration(arm, np.radians(q_deg))
+    q = configuration_argument(arm, "fk", q_deg)
     pose, displacements = forward_kinematics(arm, q), tendon_displacements(arm, q)
     if json:
         print_json(
@@ -146,7 +153,7 @@ def _solve_and_report(
         found = all_ik(arm, target, project_rotations=project_rotations)
         clear = None if obstacles is None else _clearances(arm, found, obstacles)
         return _report_all(arm, found, clear, json, many=poses is not None)
-    near = None if not q0_deg else np.radians(q0_deg)
+    near = configuration_argument(arm, "--q0-deg", q0_deg) if q0_deg else None
     one = solve_ik(
         arm,
         target,
@@ -235,7 +242,10 @@ def _report_one(arm: Robot, found: IkResult, json: bool) -> int:
         print_json(_one_document(arm, found))
         return 0 if found.converged else 1
     status = IkStatus(int(found.status)).name.lower()
-    heading = "solution" if found.converged else f"NOT REACHED ({status}); the closest found"
+    reached = bool(found.converged)
+    heading = verdict(
+        "solution" if reached else f"NOT REACHED ({status}); the closest found", reached
+    )
     table = Table("segment", "bending [deg]", "azimuth [deg]", "at its limit", title=heading)
     for i, (theta, phi) in enumerate(np.degrees(found.q.reshape(-1, 2)), start=1):
         limit = "yes" if found.binding_limit[i - 1] else ""
@@ -245,6 +255,8 @@ def _report_one(arm: Robot, found: IkResult, json: bool) -> int:
         f"position error {1e3 * found.position_error:.3g} mm, "
         f"orientation error {np.degrees(found.orientation_error):.3g} deg"
     )
+    if not reached:
+        console.print("muxjax sweep draws where the arm reaches", style="aside")
     if found.clearance is not None:
         console.print(
             f"clearance {1e3 * float(found.clearance):.1f} mm, least at segment "

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import sys
 from types import TracebackType
 from typing import Self
 
-from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeElapsedColumn
 from rich.progress import Progress as Bar
 from rich.table import Table
 
+from muxjax.cli.output import errors, notice, verdict
 from muxjax.hardware import Check, Progress
 
 
@@ -21,7 +20,7 @@ class Reporter:
     """
 
     def __init__(self) -> None:
-        self._console = Console(stderr=True, markup=False, highlight=False)
+        self._console = errors
         self._bar = Bar(
             TextColumn("{task.description}"),
             BarColumn(),
@@ -59,12 +58,20 @@ class Reporter:
             self._instruction = progress.instruction
             if done < progress.instructions:
                 total = progress.instructions
-                print(f"instruction {progress.instruction} of {total}", file=sys.stderr, flush=True)
+                notice(f"instruction {progress.instruction} of {total}")
+
+
+def work_bar() -> Bar:
+    """A bar for long work, on standard error: standard output holds results alone."""
+    columns = ("{task.description}", BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
+    return Bar(*columns, console=errors, transient=True, disable=not errors.is_terminal)
 
 
 def preflight_table(checks: tuple[Check, ...]) -> Table:
     """The preflight report."""
     table = Table("preflight", "", "found")
     for check in checks:
-        table.add_row(check.name, "pass" if check.passed else "FAIL", check.detail)
+        table.add_row(
+            check.name, verdict("pass" if check.passed else "FAIL", check.passed), check.detail
+        )
     return table

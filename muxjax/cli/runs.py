@@ -14,7 +14,7 @@ import numpy as np
 import tyro
 from rich.table import Table
 
-from muxjax.cli.output import console, notice, print_json
+from muxjax.cli.output import console, notice, print_json, verdict
 from muxjax.cli.plans import Method, plan_to_configuration, problem_fields
 from muxjax.cli.poses import Quaternion, Xyz, pose_argument
 from muxjax.cli.progress import Reporter
@@ -162,7 +162,7 @@ def resume(
     """
     arm = load_robot(robot)
     if not journal.is_file():
-        raise ValueError(f"{journal}: no such journal")
+        raise ValueError(f"{journal}: no such journal; muxjax run --journal writes one")
     translation = None if mapping is None else Translation(mapping)
     fields = problem_fields(arm, None, preset, max_step_mm, world)
     del fields["servos"]  # new plans have those that are left
@@ -240,7 +240,8 @@ def report(done: Run, program: Program, json: bool, journal: Path | None = None)
         table.add_row(str(number), str(r.axial), f"{r.start_s:.2f}", f"{r.end_s:.2f}", str(r.trims))
     console.print(table)
     console.print(
-        f"{done.reason}: {done.duration_s:.2f} s on the board's clock, wheels within "
+        verdict(done.reason, done.completed)
+        + f": {done.duration_s:.2f} s on the board's clock, wheels within "
         f"{1e3 * np.max(error):.3f} mm of the target"
     )
     if done.failed_servos:

@@ -9,7 +9,7 @@ import numpy as np
 import tyro
 from rich.table import Table
 
-from muxjax.cli.output import choice_of, console, pose_document, print_json, row_of
+from muxjax.cli.output import choice_of, console, pose_document, print_json, row_of, verdict
 from muxjax.cli.poses import Xyz
 from muxjax.robot import load_robot
 from muxjax.statics import (
@@ -143,7 +143,12 @@ def _print_posture(arm: ElasticChain, found: Equilibrium) -> None:
     if found.converged and not found.stable:
         heading += ": UNSTABLE, an arm would not stay there"
     ours, pcc = pose_document(found.pose), pose_document(_pcc_tip(arm, found))
-    table = Table("tip", "statics", "constant curvature, same lengths", title=heading)
+    table = Table(
+        "tip",
+        "statics",
+        "constant curvature, same lengths",
+        title=verdict(heading, bool(found.converged)),
+    )
     table.add_row("position [mm]", *(row_of(x["position_m"], 1e3, 1) for x in (ours, pcc)))
     table.add_row("roll, pitch, yaw [deg]", *(row_of(x["rpy_deg"], 1, 1) for x in (ours, pcc)))
     console.print(table)
@@ -368,15 +373,18 @@ def _figures() -> Any:
     return figures
 
 
-_COMMANDS: dict[str, Any] = {
+COMMANDS: dict[str, Any] = {
     "posture": posture,
     "calibrate": fit_chain,
     "experiment": experiment,
 }
-_Choice: Any = choice_of(_COMMANDS)
+_Choice: Any = choice_of(COMMANDS)
 
 
 def statics(command: tyro.conf.OmitArgPrefixes[_Choice]) -> int:
-    """True postures under weight and load, calibration, and the second paper's experiment."""
+    """True postures under weight and load, calibration, and the second paper's experiment.
+
+    Example: muxjax statics posture --displacements-mm -4 0 4 0 -6 0 6 0 --mounting hanging
+    """
     code: int = command
     return code

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 from typing import Any, Literal
 
 from rich.table import Table
 
-from muxjax.cli.output import console, print_json
+from muxjax.cli.output import complain, console, print_json
 from muxjax.collision import World, load_world
 from muxjax.robot import load_robot
 from muxjax.workspace import DesignStudy, Sweep, SweepInterruptedError, design_study
@@ -81,7 +80,7 @@ def sweep(
             resume=resume,
         )
     except SweepInterruptedError as interruption:
-        print(f"muxjax: {interruption}; --resume goes on", file=sys.stderr)
+        complain(f"{interruption}; --resume goes on")
         return 130
     checkpoint.unlink(missing_ok=True)
     return _report_sweep(found, obstacles, out, json)
@@ -169,6 +168,6 @@ def _plots() -> Any:
     try:
         from muxjax.workspace import plots
     except ImportError:
-        print("muxjax: no plots: they need matplotlib, pip install 'muxjax[viz]'", file=sys.stderr)
+        complain("no plots: they need matplotlib, pip install 'muxjax[viz]'")
         return None
     return plots

@@ -10,7 +10,7 @@ import numpy as np
 import tyro
 from rich.table import Table
 
-from muxjax.cli.output import console, print_json
+from muxjax.cli.output import console, print_json, verdict
 from muxjax.hardware import LockstepLink
 from muxjax.pipeline.missions.files import MissionConfig, load_mission
 from muxjax.pipeline.missions.plan import Planner
@@ -67,7 +67,7 @@ def task(
     else:
         _print(scene, done, drawn, time.perf_counter() - began)
         if refusal:
-            console.print(f"not completed: {refusal}")
+            console.print(verdict(f"not completed: {refusal}", False))
     return 1 if refusal else 0
 
 

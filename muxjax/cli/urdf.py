@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from muxjax.cli.output import console, print_json
+from muxjax.cli.output import configuration_argument, console, print_json
 from muxjax.robot import load_robot
 from muxjax.urdf import save_urdf, urdf_joint_angles, urdf_joints
 
@@ -36,7 +36,10 @@ def urdf(
     arm = load_robot(robot)
     names = urdf_joints(arm, per_segment)
     document: dict[str, object] = {"robot": arm.config.name, "joints": names}
-    angles = None if q_deg is None else urdf_joint_angles(arm, np.radians(q_deg), per_segment)
+    angles = None
+    if q_deg is not None:
+        q = configuration_argument(arm, "--q-deg", q_deg)
+        angles = urdf_joint_angles(arm, q, per_segment)
     if out is not None:
         save_urdf(arm, out, per_segment)
         document["file"] = str(out)

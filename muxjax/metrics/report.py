@@ -80,7 +80,7 @@ def markdown(protocol: Protocol, table: Table) -> str:
     for servos in sorted({row.servos for row in table.rows}):
         lines = [row_cells(row) for row in table.rows if row.servos == servos]
         lines += [published_cells(c) for c in protocol.published if c.servos == servos]
-        parts += [f"### {_servos(servos)}", _markdown_table(header(segments), lines)]
+        parts += [f"### {_servos(servos)}", markdown_table(header(segments), lines)]
     parts += ["### Paired differences", _DIFFERENCES, *_difference_tables(table, segments)]
     parts += ["### The paper's side claims", *_side_claims(protocol, table)]
     parts += ["### Notes", "\n".join(f"- {note}" for note in protocol.notes)]
@@ -102,7 +102,7 @@ def _difference_tables(table: Table, segments: int) -> Iterable[str]:
     names += [f"peak {i} [%]" for i in range(2, segments + 1)]
     for servos in sorted({d.servos for d in table.differences}):
         lines = [_difference_cells(d) for d in table.differences if d.servos == servos]
-        yield f"{_servos(servos)}:\n\n" + _markdown_table([*names, "tip [mm]"], lines)
+        yield f"{_servos(servos)}:\n\n" + markdown_table([*names, "tip [mm]"], lines)
 
 
 def _difference_cells(d: Difference) -> list[str]:
@@ -118,7 +118,7 @@ def _side_claims(protocol: Protocol, table: Table) -> Iterable[str]:
     for s in table.speed_ups:
         by_setting.setdefault(s.setting, [s.setting]).append(interval(s.factor, 2))
     names = ["method", *(f"{fewer} to {more} servos" for fewer, more in steps)]
-    yield _markdown_table(names, list(by_setting.values()))
+    yield markdown_table(names, list(by_setting.values()))
     yield (
         f"BeamStep without its switch weight against {protocol.greedy!r} (the paper: its behaviour "
         f"then approaches greedy); difference to greedy with the weight ({protocol.beamstep!r}) "
@@ -133,10 +133,11 @@ def _side_claims(protocol: Protocol, table: Table) -> Iterable[str]:
         ]
         for s in table.switch_weight
     ]
-    yield _markdown_table(names, lines)
+    yield markdown_table(names, lines)
 
 
-def _markdown_table(names: list[str], lines: list[list[str]]) -> str:
+def markdown_table(names: list[str], lines: list[list[str]]) -> str:
+    """A table in Markdown."""
     rows = [names, ["---"] * len(names), *lines]
     return "\n".join("| " + " | ".join(row) + " |" for row in rows)
 

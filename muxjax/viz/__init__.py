@@ -10,6 +10,7 @@ from muxjax.viz.programs import (
     colour,
     compare_programs,
     draw_arm,
+    programs_figure,
     style,
 )
 
@@ -20,5 +21,6 @@ __all__ = [
     "colour",
     "compare_programs",
     "draw_arm",
+    "programs_figure",
     "style",
 ]

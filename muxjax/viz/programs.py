@@ -19,9 +19,10 @@ from muxjax.planning.motion import angles_at
 from muxjax.robot import Robot
 from muxjax.scheduler import Program, Trajectory
 from muxjax.tendons import configuration_from_tendons
+from muxjax.viz.style import MARKERS, STYLE, save_figure
 
-# Okabe-Ito colours by segment, distinguishable without colour vision and, with the line styles
-# by tendon, in grey print.
+# Okabe-Ito colours by segment, distinguishable without colour vision; in grey print the markers
+# tell segments apart, and the line styles their tendons.
 SEGMENT_COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
 TENDON_STYLES = ("-", "--", ":", "-.")
 _POINTS_A_SEGMENT = 24
@@ -34,6 +35,11 @@ def colour(segment: int) -> str:
     return SEGMENT_COLOURS[segment % len(SEGMENT_COLOURS)]
 
 
+def marker(segment: int) -> str:
+    """Marker of a segment, counting from 0."""
+    return MARKERS[segment % len(MARKERS)]
+
+
 def style(tendon: int) -> str:
     """Line style of a tendon within its segment, counting from 0."""
     return TENDON_STYLES[tendon % len(TENDON_STYLES)]
@@ -42,6 +48,20 @@ def style(tendon: int) -> str:
 def compare_programs(
     robot: Robot, programs: Mapping[str, Program], title: str, path: str | Path
 ) -> Path:
+    """Write ``programs_figure``.
+
+    Args:
+        robot: The arm.
+        programs: By the name that heads their panel.
+        title: Above the figure.
+        path: Image to write; the ending chooses the format.
+    """
+    return save_figure(programs_figure(robot, programs, title), path, dpi=110)
+
+
+def programs_figure(
+    robot: Robot, programs: Mapping[str, Program], title: str, *, letters: str = ""
+) -> Figure:
     """Tendon displacements and bending angles over time, a panel a program (after M Fig. 6).
 
     Shaded stretches are motion, blank ones repositioning; dotted lines are the final angles.
@@ -50,78 +70,97 @@ def compare_programs(
         robot: The arm.
         programs: By the name that heads their panel.
         title: Above the figure.
-        path: Image to write; the ending chooses the format.
+        letters: Of the arm and of the panels, in the order of the programs; none by default.
     """
+    with mpl.rc_context(STYLE):
+        return _programs_figure(robot, programs, title, [f"({x}) " for x in letters])
+
+
+def _programs_figure(
+    robot: Robot, programs: Mapping[str, Program], title: str, letters: list[str]
+) -> Figure:
+    letters = letters or [""] * (len(programs) + 1)
     columns = min(len(programs), _PANELS_A_ROW)
     bands = -(-len(programs) // columns)
-    figure = Figure(figsize=(2.8 * columns + 5.4, 4.9 * bands + 0.7), layout="constrained")
+    figure = Figure(figsize=(1.75 * columns + 3.0, 3.3 * bands + 0.6), layout="constrained")
     figure.suptitle(title)
-    # The second column is left empty: the arm's axis labels reach into it.
-    grid = figure.add_gridspec(2 * bands, columns + 2, width_ratios=[1.8, 0.3, *[1] * columns])
-    arm = figure.add_subplot(grid[:, 0], projection="3d")
+    left, right = figure.subfigures(1, 2, squeeze=False, width_ratios=[2.8, 1.75 * columns])[0]
+    arm = left.add_subplot(projection="3d")
     first = next(iter(programs.values()))
     draw_arm(arm, robot, np.array(first.start), alpha=0.35)
     draw_arm(arm, robot, np.array(first.target))
     _frame_arm(arm, robot)
-    arm.set_title("start (pale) and target", fontsize=9)
+    arm.set_title(f"{letters[0]}start (pale) and target")
+    grid = right.add_gridspec(2 * bands, columns)
     top: list[Any] = []
     for number, (name, program) in enumerate(programs.items()):
         band, column = divmod(number, columns)
-        lengths = figure.add_subplot(grid[2 * band, column + 2], sharey=top[0] if top else None)
-        angles = figure.add_subplot(
-            grid[2 * band + 1, column + 2], sharex=lengths, sharey=top[1] if top else None
+        lengths = right.add_subplot(grid[2 * band, column], sharey=top[0] if top else None)
+        angles = right.add_subplot(
+            grid[2 * band + 1, column], sharex=lengths, sharey=top[1] if top else None
         )
         top = top or [lengths, angles]
         line = timeline(robot, program)
         _draw_lengths(lengths, robot, line)
         _draw_angles(angles, robot, line)
         lengths.set_title(
-            f"{name}\n{line.time_s[-1]:.1f} s, {len(program.instructions)} stages", fontsize=9
+            f"{letters[number + 1]}{name}\n"
+            f"{line.time_s[-1]:.1f} s, {len(program.instructions)} stages"
         )
         for axes in (lengths, angles):
             _shade_motion(axes, line)
-            axes.grid(alpha=0.3)
-            axes.tick_params(labelsize=8, labelleft=column == 0)
+            axes.tick_params(labelleft=column == 0)
         lengths.tick_params(labelbottom=False)
-        angles.set_xlabel("time [s]", fontsize=9)
+        angles.set_xlabel("time [s]")
         if column == 0:
-            lengths.set_ylabel("tendon displacement [mm]", fontsize=9)
-            angles.set_ylabel("bending angle [deg]", fontsize=9)
-    figure.legend(*_legend(robot), loc="outside lower center", ncols=8, fontsize=8)
-    return _save(figure, path)
+            lengths.set_ylabel("displacement [mm]")
+            angles.set_ylabel("bending angle [deg]")
+    # Of all panels, which share their scales: a limit before the last one would cut those after it.
+    top[1].set_ylim(0, top[1].get_ylim()[1])
+    figure.legend(*_legend(robot), loc="outside lower center", ncols=7)
+    return figure
 
 
 def _draw_lengths(axes: Any, robot: Robot, line: Trajectory) -> None:
     for c, values in enumerate(line.displacements.T):
         segment, tendon = divmod(c, robot.tendons_per_segment)
-        axes.plot(line.time_s, 1e3 * values, style(tendon), color=colour(segment), lw=1.2)
+        at = [0, *np.flatnonzero(np.diff(values)) + 1, len(values) - 1]  # where it has moved
+        axes.plot(
+            line.time_s, 1e3 * values, style(tendon), marker=marker(segment), markevery=at,
+            ms=2.5, color=colour(segment), lw=1.0,
+        )  # fmt: skip
 
 
 def _draw_angles(axes: Any, robot: Robot, line: Trajectory) -> None:
     times = np.union1d(np.linspace(0, line.time_s[-1], 400), line.time_s)
     theta = np.degrees(angles_at(robot, line.at(times)))
     for segment, values in enumerate(theta.T):
-        axes.plot(times, values, color=colour(segment), lw=1.4)
+        # Markers of segments that run together stand beside each other.
+        every = (0.03 * segment, 0.16)
+        axes.plot(times, values, color=colour(segment), lw=1.2, marker=marker(segment), ms=3,
+                  markevery=every)  # fmt: skip
         axes.axhline(values[-1], color=colour(segment), ls=":", lw=0.9)
-    axes.set_ylim(bottom=0)
 
 
 def _shade_motion(axes: Any, line: Trajectory) -> None:
     moving = np.any(np.diff(line.displacements, axis=0) != 0, axis=-1)
     for begin, end in zip(line.time_s[:-1][moving], line.time_s[1:][moving], strict=True):
-        axes.axvspan(begin, end, color="0.5", alpha=0.12, lw=0)
+        axes.axvspan(begin, end, color="0.5", alpha=0.15, lw=0)
     axes.set_xlim(0, max(line.time_s[-1], 1e-9))
 
 
 def _legend(robot: Robot) -> tuple[list[Any], list[str]]:
-    segments = [mpl.lines.Line2D([], [], color=colour(i), lw=2) for i in range(robot.n_segments)]
+    segments = [
+        mpl.lines.Line2D([], [], color=colour(i), lw=1.5, marker=marker(i), ms=4)
+        for i in range(robot.n_segments)
+    ]
     tendons = [
         mpl.lines.Line2D([], [], color="0.3", ls=style(j)) for j in range(robot.tendons_per_segment)
     ]
+    motion = mpl.patches.Patch(color="0.5", alpha=0.15, lw=0)
     names = [f"segment {i + 1}" for i in range(robot.n_segments)]
-    return segments + tendons, names + [
-        f"tendon {j + 1} of the segment" for j in range(robot.tendons_per_segment)
-    ]
+    names += [f"tendon {j + 1} of the segment" for j in range(robot.tendons_per_segment)]
+    return [*segments, *tendons, motion], [*names, "motion"]
 
 
 def draw_arm(
@@ -222,6 +261,7 @@ def _frame_arm(axes: Any, robot: Robot) -> None:
     axes.set_ylabel("y [mm]", fontsize=8)
     axes.set_zlabel("z [mm]", fontsize=8)
     axes.tick_params(labelsize=7)
+    axes.locator_params(nbins=4)
     axes.view_init(elev=18, azim=-60)
 
 
@@ -268,10 +308,3 @@ def _moving_at(line: Trajectory, time: float) -> list[int]:
     stretch = min(int(np.searchsorted(line.time_s, time, side="right")), len(line.time_s) - 1)
     step = line.displacements[stretch] - line.displacements[max(stretch - 1, 0)]
     return [int(c) for c in np.flatnonzero(step)]
-
-
-def _save(figure: Figure, path: str | Path) -> Path:
-    path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path, dpi=110)
-    return path

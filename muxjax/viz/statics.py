@@ -16,14 +16,15 @@ from muxjax.statics.curvature import pcc_bending, pcc_frames
 from muxjax.statics.experiment import Experiment
 from muxjax.statics.result import Equilibrium
 from muxjax.viz.programs import SEGMENT_COLOURS
+from muxjax.viz.style import GREY, INK, STYLE, save_figure
 
-_INK, _GREY = "#1f2933", "0.55"
 _METHODS = {
     "FST": SEGMENT_COLOURS[1],
     "FSL": SEGMENT_COLOURS[0],
     "PCC from lengths": SEGMENT_COLOURS[2],
     "PCC from ends": SEGMENT_COLOURS[3],
 }
+_HATCHES = ("", "///", "...", "xxx", "---", "+++")  # of segments, for print in grey
 _POINTS = 20  # a segment of an arc
 
 
@@ -54,12 +55,9 @@ def draw_posture(chain: ElasticChain, found: Equilibrium, path: str | Path) -> P
     """
     figure = Figure(figsize=(9.6, 3.9), layout="constrained")
     views = figure.subplots(1, 3, width_ratios=[1, 1, 1.1])
-    ours = 1e3 * joint_frames(chain, np.asarray(found.angles))[:, :3, 3]
-    arcs = pcc_frames(chain, pcc_bending(chain, np.asarray(found.displacements)), _POINTS)
-    pcc = 1e3 * arcs[:, :3, 3]
-    home = 1e3 * joint_frames(chain, np.zeros(chain.n_joints))[[0, -1], :3, 3]
+    home, pcc, ours = _shapes(chain, found).values()
     for axes, across in zip(views[:2], (0, 1), strict=True):
-        axes.plot(*home[:, [across, 2]].T, color=_GREY, lw=1, ls=":", label="straight")
+        axes.plot(*home[:, [across, 2]].T, color=GREY, lw=1, ls=":", label="straight")
         axes.plot(*pcc[:, [across, 2]].T, color=_METHODS["PCC from lengths"], ls="--", lw=1.8,
                   label="constant curvature")  # fmt: skip
         axes.plot(*ours[:, [across, 2]].T, color=_METHODS["FSL"], lw=2.6, label="statics")
@@ -73,20 +71,71 @@ def draw_posture(chain: ElasticChain, found: Equilibrium, path: str | Path) -> P
     gap = np.linalg.norm(ours[-1] - pcc[-1])
     state = "" if found.converged else " (NO EQUILIBRIUM FOUND)"
     figure.suptitle(f"{chain.name}: constant curvature misses the tip by {gap:.0f} mm{state}")
-    return _save(figure, path)
+    return save_figure(figure, path, dpi=150)
+
+
+def mountings_figure(chain: ElasticChain, found: Mapping[str, Equilibrium]) -> Figure:
+    """The same tendon lengths under other directions of gravity: postures, and tensions below.
+
+    Args:
+        chain: The arm.
+        found: Equilibria without batch axes, by how the arm is mounted.
+    """
+    with mpl.rc_context(STYLE):
+        figure = Figure(figsize=(2.6 * len(found), 5.2), layout="constrained")
+        grid = figure.subplots(2, len(found), height_ratios=[1.5, 1], squeeze=False)
+        shapes = {name: _shapes(chain, one) for name, one in found.items()}
+        everything = np.concatenate([line for lines in shapes.values() for line in lines.values()])
+        for axes, (name, lines) in zip(grid[0], shapes.items(), strict=True):
+            _draw_shapes(axes, lines)
+            gap = np.linalg.norm(lines["statics"][-1] - lines["constant curvature"][-1])
+            state = "" if found[name].converged else ", NO EQUILIBRIUM"
+            axes.set_title(f"{name}: constant curvature\n{gap:.0f} mm off at the tip{state}")
+        _same_scale(grid[0], everything, across=[0] * len(found))
+        largest = max(float(np.max(one.tension)) for one in found.values())
+        for axes, one in zip(grid[1], found.values(), strict=True):
+            _draw_tensions(axes, chain, one)
+            axes.set_ylim(0, 1.45 * largest)
+        handles = grid[0, 0].get_legend_handles_labels()
+        figure.legend(*handles, loc="outside lower center", ncols=4)
+        return figure
+
+
+def _shapes(chain: ElasticChain, found: Equilibrium) -> dict[str, Float[np.ndarray, "P 3"]]:
+    """Lines of an arm [mm] by what they are."""
+    arcs = pcc_frames(chain, pcc_bending(chain, np.asarray(found.displacements)), _POINTS)
+    return {
+        "straight": 1e3 * joint_frames(chain, np.zeros(chain.n_joints))[[0, -1], :3, 3],
+        "constant curvature": 1e3 * arcs[:, :3, 3],
+        "statics": 1e3 * joint_frames(chain, np.asarray(found.angles))[:, :3, 3],
+    }
+
+
+def _draw_shapes(axes: Any, lines: Mapping[str, Float[np.ndarray, "P 3"]]) -> None:
+    looks = {
+        "straight": {"color": GREY, "lw": 1, "ls": ":"},
+        "constant curvature": {"color": _METHODS["PCC from lengths"], "lw": 1.4, "ls": "--"},
+        "statics": {"color": _METHODS["FSL"], "lw": 2.0},
+    }
+    for name, line in lines.items():
+        axes.plot(*line[:, [0, 2]].T, label=name, **looks[name])
+    axes.set_xlabel("x [mm]")
+    axes.set_ylabel("z [mm]")
 
 
 def _mark_ends(axes: Any, points: Float[np.ndarray, "S 2"]) -> None:
     axes.plot(*points.T, "o", color="white", markeredgecolor=_METHODS["FSL"], ms=6, mew=1.6)
 
 
-def _same_scale(views: Sequence[Any], points: Float[np.ndarray, "P 3"]) -> None:
-    """Both views with equal axes and the same height."""
+def _same_scale(
+    views: Sequence[Any], points: Float[np.ndarray, "P 3"], across: Sequence[int] = (0, 1)
+) -> None:
+    """Views with equal axes and the same height; ``across`` is their axis to the right."""
     low, high = points.min(axis=0), points.max(axis=0)
     half = 0.55 * max(high - low)
-    for axes, across in zip(views, (0, 1), strict=True):
+    for axes, right in zip(views, across, strict=True):
         middle = 0.5 * (low + high)
-        axes.set_xlim(middle[across] - half, middle[across] + half)
+        axes.set_xlim(middle[right] - half, middle[right] + half)
         axes.set_ylim(middle[2] - half, middle[2] + half)
         axes.set_aspect("equal")
         axes.grid(alpha=0.25)
@@ -101,15 +150,16 @@ def _draw_tensions(axes: Any, chain: ElasticChain, found: Equilibrium) -> None:
     for end in sorted(set(ends)):
         own = np.array(ends) == end
         axes.bar(numbers[own], tension[own], color=SEGMENT_COLOURS[end % 6], width=0.7,
-                 label=f"segment {end + 1}")  # fmt: skip
+                 hatch=_HATCHES[end % 6], edgecolor="white", label=f"segment {end + 1}",
+                 )  # fmt: skip
     top = max(float(tension.max()), 1e-3)
     for number, slack in zip(numbers, np.asarray(found.slack), strict=True):
         if slack:
             axes.text(number, 0.02 * top, "slack", rotation=90, ha="center", va="bottom",
-                      fontsize=8, color=_GREY)  # fmt: skip
+                      fontsize=8, color=GREY)  # fmt: skip
     axes.set_xticks(numbers)
     axes.set_ylim(0, 1.15 * top)
-    axes.set_xlabel("tendon")
+    axes.set_xlabel("tendon [-]")
     axes.set_ylabel("tension [N]")
     axes.tick_params(labelsize=8)
     axes.grid(axis="y", alpha=0.25)
@@ -132,7 +182,7 @@ def draw_errors(found: Experiment, path: str | Path) -> Path:
         axes.set_ylabel(label, fontsize=9)
     count = len(found.travel)
     figure.suptitle(f"{found.chain.name}, synthetic experiment: {count} static configurations")
-    return _save(figure, path)
+    return save_figure(figure, path, dpi=150)
 
 
 def _boxes(axes: Any, values: Mapping[str, Float[np.ndarray, " N"]]) -> None:
@@ -166,7 +216,7 @@ def draw_configurations(found: Experiment, path: str | Path, *, most: int = 6) -
     chosen = np.sort(np.argsort(-found.travel)[:most])
     target = 1e3 * found.measured.segment_ends[:, -1, :3, 3]
     wide = int(np.argmax(np.ptp(target[chosen, :2], axis=0)))
-    tips.plot(*target[chosen][:, [wide, 2]].T, "o", color=_INK, ms=9, mfc="none", label="measured")
+    tips.plot(*target[chosen][:, [wide, 2]].T, "o", color=INK, ms=9, mfc="none", label="measured")
     for name, marker in zip(found.predicted, "^svx", strict=True):
         points = 1e3 * found.predicted[name][chosen, :3, 3][:, [wide, 2]]
         tips.plot(*points.T, marker, color=_METHODS[name], ms=6, ls="none", label=name)
@@ -178,7 +228,7 @@ def draw_configurations(found: Experiment, path: str | Path, *, most: int = 6) -
     tips.legend(fontsize=8, frameon=False)
     _draw_filter(filtered, found)
     figure.suptitle(f"{found.chain.name}, synthetic experiment")
-    return _save(figure, path)
+    return save_figure(figure, path, dpi=150)
 
 
 def _draw_filter(axes: Any, found: Experiment) -> None:
@@ -221,7 +271,7 @@ def draw_pitch(
     axes.set_xticks(ticks, [str(n) for n in ticks])
     axes.xaxis.set_minor_locator(mpl.ticker.NullLocator())
     axes.legend(frameon=False, fontsize=9)
-    return _save(figure, path)
+    return save_figure(figure, path, dpi=150)
 
 
 def draw_cost(
@@ -241,7 +291,7 @@ def draw_cost(
     axes.set_xticks(list(joints), [str(n) for n in joints])
     axes.xaxis.set_minor_locator(mpl.ticker.NullLocator())
     axes.legend(frameon=False, fontsize=9)
-    return _save(figure, path)
+    return save_figure(figure, path, dpi=150)
 
 
 def _log_log(x: str, y: str) -> tuple[Figure, Any]:
@@ -256,10 +306,3 @@ def _log_log(x: str, y: str) -> tuple[Figure, Any]:
     axes.set_ylabel(y)
     axes.grid(alpha=0.25)
     return figure, axes
-
-
-def _save(figure: Figure, path: str | Path) -> Path:
-    path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path, dpi=150)
-    return path

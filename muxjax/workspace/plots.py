@@ -16,8 +16,16 @@ _INK, _ACCENT, _MUTED = "#1f2933", "#c2410c", "#64748b"
 
 
 def dexterity_map(sweep: Sweep, path: str | Path) -> Path:
-    """The xz plane, coloured by dexterity (as M Fig. 8c); the half plane and its mirror image."""
+    """Write ``draw_dexterity`` as a picture of its own."""
     figure, axes = _figure(7.2, 5.6)
+    draw_dexterity(figure, axes, sweep)
+    axes.legend(loc="upper right", frameon=False)
+    axes.set_title(f"{_name(sweep)}: dexterity from {sweep.samples:,} samples", loc="left")
+    return _save(figure, path)
+
+
+def draw_dexterity(figure: Any, axes: Any, sweep: Sweep) -> None:
+    """The xz plane, coloured by dexterity (as M Fig. 8c); the half plane and its mirror image."""
     table, cells = sweep.half_plane, sweep.cells
     r_mm = 1e3 * cells.r_edges
     x = np.concatenate([-r_mm[:0:-1], r_mm])
@@ -34,13 +42,10 @@ def dexterity_map(sweep: Sweep, path: str | Path) -> Path:
     tolerance = sweep.about["tolerance_deg"]
     bar.set_label(f"dexterity: share of orientations met within {tolerance:g}°  [-]")
     axes.plot(0, 0, marker="^", color=_ACCENT, markersize=9, linestyle="none", label="arm root")
-    axes.legend(loc="upper right", frameon=False)
     _trim(axes, sweep)
     axes.set_aspect("equal")
     axes.set_xlabel("x  [mm]")
     axes.set_ylabel("z, along the base axis  [mm]")
-    axes.set_title(f"{_name(sweep)}: dexterity from {sweep.samples:,} samples", loc="left")
-    return _save(figure, path)
 
 
 def clear_map(sweep: Sweep, world: World, path: str | Path) -> Path:

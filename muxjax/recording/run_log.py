@@ -1,0 +1,159 @@
+"""A run from the frames that ``muxjax run --log`` has written (candump -L)."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from muxjax.config import ConfigError
+from muxjax.hardware.protocol import Fault, Frame, Port, Received
+from muxjax.hardware.sensors import Sensors
+from muxjax.recording.recording import Recording, take
+from muxjax.robot import Robot
+from muxjax.scheduler import Trajectory
+from muxjax.trajectory_file import sample
+
+_LINE = re.compile(rb"^\((\d+\.\d+)\) \S+ ([0-9A-Fa-f]{3})#([0-9A-Fa-f]{0,16})(?: ([TR]))?\s*$")
+
+
+@dataclass(frozen=True, eq=False)
+class LoggedRun:
+    """What a board has reported, whenever its last wheel did.
+
+    Attributes:
+        time_s: Of the file [s], never falling.
+        displacements: By the wheels' encoders [m].
+        servo_rad: Shaft angles of the servos [rad].
+        axial: Axial position, from 1; 0 between two.
+        engaged: Tendons whose clutches are energised.
+        refused: Frames of the board that were damaged, and were left out.
+    """
+
+    time_s: Float[np.ndarray, " P"]
+    displacements: Float[np.ndarray, "P SJ"]
+    servo_rad: Float[np.ndarray, "P J"]
+    axial: Int[np.ndarray, " P"]
+    engaged: Bool[np.ndarray, "P SJ"]
+    refused: int
+
+    @property
+    def trajectory(self) -> Trajectory:
+        """Tendon displacements by the wheels, from time 0 on."""
+        return Trajectory(self.time_s - self.time_s[0], self.displacements)
+
+
+def read_log(robot: Robot, path: str | Path) -> LoggedRun:
+    """Read a run's frames.
+
+    From when on every wheel's turn and every servo is known; while a board says that it has lost
+    its turn counts, nothing is.
+
+    Args:
+        robot: The arm on the board.
+        path: File of ``muxjax run --log``, or of ``candump -L``.
+
+    Raises:
+        ConfigError: No such file, a line that is none of candump's, times that fall, or no moment
+            at which the board has reported everything.
+    """
+    sensors, port, refused = Sensors(robot), Port("HOST"), 0
+    last_group = f"WHEEL_FB_{(robot.n_tendons - 1) // 3 % 3 + 1}", (robot.n_tendons - 1) // 9
+    times: list[float] = []
+    rows: list[tuple[np.ndarray, np.ndarray, int, np.ndarray]] = []
+    boots, lost = -1, True  # until the board's first heartbeat nothing is believed
+    for at_s, frame in _frames(Path(path)):
+        read = port.unpack(frame)
+        if not isinstance(read, Received):
+            refused += 1
+            continue
+        if read.name == "WHEEL_TURNS" and lost:
+            continue  # the board counts from wherever it woke up
+        sensors.update(at_s, read.name, read.values)
+        if read.name == "BOARD_HB":
+            lost = Fault.TURNS_LOST in sensors.faults
+            if lost or sensors.boot_count != boots:
+                sensors.forget_turns()
+            boots = sensors.boot_count
+        whole = (read.name, read.values.get("Group")) == last_group
+        if whole and sensors.complete:
+            times.append(at_s)
+            state = sensors.slot, _engaged(robot, sensors.clutches)
+            rows.append((sensors.displacements(), sensors.servo_rad.copy(), *state))
+    if not rows:
+        raise ConfigError(
+            f"{path}: at no moment has every wheel and every servo of {robot.config.name!r} "
+            "reported; is it the log of a run of this robot?"
+        )
+    lengths, servos, axial, engaged = zip(*rows, strict=True)
+    return LoggedRun(
+        np.array(times),
+        np.stack(lengths),
+        np.stack(servos),
+        np.array(axial),
+        np.stack(engaged),
+        refused,
+    )
+
+
+def logged_recording(robot: Robot, run: LoggedRun, rate_hz: float = 50.0) -> Recording:
+    """A run at equal times; lengths in between on straight lines, the rest as last reported.
+
+    Raises:
+        ValueError: A rate that cannot serve.
+    """
+    samples = sample(robot, run.trajectory, rate_hz)
+    times = run.time_s - run.time_s[0]
+    return Recording(
+        samples=samples,
+        begin_s=float(run.time_s[0]),
+        servo_rad=take(run.servo_rad, times, samples.time_s),
+        axial=take(run.axial, times, samples.time_s),
+        engaged=take(run.engaged.astype(int), times, samples.time_s).astype(bool),
+        source="run",
+    )
+
+
+def _frames(path: Path) -> Iterator[tuple[float, Frame]]:
+    """Times [s] and the board's frames; those of the host say nothing about where the arm is.
+
+    candump marks no direction; then every frame is taken, and the port refuses the host's own.
+    """
+    try:
+        lines = path.read_bytes().splitlines()
+    except OSError as error:
+        raise ConfigError(f"{path}: cannot be read: {error.strerror}") from error
+    before = -np.inf
+    for number, line in enumerate(lines, start=1):
+        if not line.strip():
+            continue
+        found = _LINE.match(line)
+        if found is None or len(found[3]) % 2:
+            raise ConfigError(
+                f"{path}, line {number}: is no line of candump -L, found {line[:60]!r}; "
+                "muxjax run --log writes such files"
+            )
+        at_s = float(found[1])
+        if at_s < before:
+            raise ConfigError(
+                f"{path}, line {number}: time {at_s:.6f} s is before {before:.6f} s: a log that "
+                "grew over several runs in lockstep? Export one run at a time"
+            )
+        before = at_s
+        if found[4] != b"T":
+            yield at_s, Frame(int(found[2], 16), bytes.fromhex(found[3].decode()))
+
+
+def _engaged(robot: Robot, clutches: tuple[int, int, int]) -> Bool[np.ndarray, " SJ"]:
+    """Energised clutches by tendon: a mask of one layer's."""
+    layer, mask, _ = clutches
+    found = np.zeros(robot.n_tendons, dtype=bool)
+    j = robot.tendons_per_segment
+    for k in range(j):
+        if layer and mask >> k & 1:
+            found[(layer - 1) * j + k] = True
+    return found

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-import shlex
 import shutil
 import subprocess
 from pathlib import Path
@@ -14,13 +13,6 @@ from muxjax.cli import COMMANDS, main
 
 DOC = (Path(__file__).resolve().parent.parent / "docs" / "command_line.md").read_text()
 EXAMPLES = dict(re.findall(r"^\| `(\w+)` \|.*\| `(muxjax .*)` \|$", DOC, re.MULTILINE))
-# Commands of commands: the help that lists options is one word further.
-FIGURES = ["fig6", "fig7", "fig8c", "gallery", "statics", "table1", "table2", "table3", "training"]
-NESTED = {
-    "config": ["schema", "check"],
-    "figure": FIGURES,
-    "statics": ["posture", "calibrate", "experiment"],
-}
 
 
 @pytest.fixture
@@ -39,23 +31,6 @@ def muxjax(capsys, monkeypatch, tmp_path):
 
 def test_the_page_has_every_command_once():
     assert list(EXAMPLES) == sorted(COMMANDS)
-
-
-@pytest.mark.parametrize("command", COMMANDS)
-def test_help_has_examples_and_the_pages_options_exist(muxjax, command):
-    words = shlex.split(EXAMPLES[command])
-    assert words[:2] == ["muxjax", command]
-    for path in [[command, inner] for inner in NESTED.get(command, [])] or [[command]]:
-        code, text = muxjax(*path, "--help")
-        assert code == 0
-        assert f"Example: muxjax {' '.join(path)}" in text
-        known = re.findall(r"^\W*(--[a-z0-9-]+)", text, re.MULTILINE)  # where a line begins with it
-        assert "--help" not in known  # which -h comes before: a line's later words do not count
-        examples = re.findall(r"Example: muxjax (.*)", text)
-        if words[1 : 1 + len(path)] == path:
-            examples.append(EXAMPLES[command])
-        for example in examples:
-            assert set(re.findall(r"(?<=\s)--[a-z0-9-]+", example)) <= set(known), example
 
 
 def test_an_unknown_option_is_bad_input(muxjax):

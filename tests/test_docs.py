@@ -8,16 +8,13 @@ from __future__ import annotations
 import functools
 import re
 import shlex
-import sys
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import pytest
 import tyro
 
 import muxjax
-from muxjax.cli import COMMANDS
+from muxjax.cli import leaves
 
 ROOT = Path(__file__).resolve().parent.parent
 DOCS = sorted((ROOT / "docs").rglob("*.md"))
@@ -26,7 +23,6 @@ API = "\n".join(page.read_text() for page in DOCS if page.parent.name == "api")
 
 PRINTED = re.compile(r"^\s*(?:\$ )?(muxjax [^\n]*)$", re.MULTILINE)  # lines of code blocks
 QUOTED = re.compile(r"`(muxjax [a-z]+ [^`]+)`")  # in a sentence
-NESTED = {name: sys.modules[f"muxjax.cli.{name}"]._COMMANDS for name in ("config", "statics")}
 
 
 def named(page: Path) -> str:
@@ -47,14 +43,13 @@ def parses(command: str) -> bool:
     words = shlex.split(command, comments=True)[1:]
     if words[0].startswith("--tyro"):  # completion: what tyro itself takes
         return True
-    call: Callable[..., Any] | None = COMMANDS.get(words.pop(0))
-    if call is not None and call.__name__ in NESTED:
-        call = NESTED[call.__name__].get(words.pop(0))
-    if call is None:
+    known = next((k for k in leaves() if tuple(words[: len(k)]) == k), None)
+    if known is None:
         return False
+    call = leaves()[known]
     heard = functools.wraps(call)(lambda **_: 0)
     try:
-        return tyro.cli(heard, args=words) == 0
+        return tyro.cli(heard, args=words[len(known) :]) == 0
     except SystemExit:
         return False
 

@@ -46,6 +46,7 @@ class Desk:
         solutions: Configurations that reach it [rad], at most ``MOST_GHOSTS``.
         chosen: Which of them the plan goes to, from 0.
         tracks: By name, in the order in which they came.
+        last: The last plan, in words.
     """
 
     def __init__(self, robot: Robot, world: World | None = None, preset: str = "paper") -> None:
@@ -58,6 +59,7 @@ class Desk:
         self.solutions: Float[np.ndarray, "K dof"] = np.zeros((0, len(self.q)))
         self.chosen = 0
         self.tracks: dict[str, Track] = {}
+        self.last = ""
         self._tension = jax.jit(Tension().tensions)
 
     # The arm
@@ -112,11 +114,14 @@ class Desk:
     def show(self, moment: Moment) -> None:
         """Stand as a moment of a track does; shapes that are not defined are left out."""
         self.displacements = moment.displacements
-        q = configuration_from_tendons(self.robot, moment.displacements)
-        if np.isfinite(q).all():
-            self.q = q
+        self.q = self.shape(moment.displacements)
         if moment.slot:
             self.axial = moment.slot
+
+    def shape(self, displacements: Float[np.ndarray, " SJ"]) -> Float[np.ndarray, " dof"]:
+        """Configuration [rad] of displacements; the present one where they define none."""
+        q = configuration_from_tendons(self.robot, displacements)
+        return q if np.isfinite(q).all() else self.q
 
     def tension(self, displacements: Float[np.ndarray, " SJ"]) -> Float[np.ndarray, " SJ"]:
         """Tension of each tendon [N] by the planner's reduced statics (assumed stiffness)."""

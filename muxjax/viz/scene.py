@@ -25,9 +25,11 @@ BY_STATE: dict[State, tuple[tuple[int, int, int], float, bool]] = {
     "paid out": ((225, 155, 0), 0.0020, True),
 }
 # Slack to the tightest: lightness falls evenly (after matplotlib's cividis, turned round).
-_TENSION_COLOURS = np.array(
+TENSION_COLOURS = np.array(
     [[253, 232, 100], [188, 175, 111], [123, 123, 119], [66, 78, 107], [0, 34, 78]], dtype=float
 )
+# Okabe-Ito colours of segments as elsewhere, mixed with white, lighter from the base to the tip.
+_SEGMENTS = ((102, 170, 209), (240, 190, 153), (178, 226, 213), (240, 215, 229))
 _AT_REST = 1e-4  # displacement from straight below which a tendon counts as held [m]
 
 
@@ -44,6 +46,11 @@ class Look:
     colour: tuple[int, int, int]
     thickness: float
     dashed: bool
+
+
+def segment_colour(segment: int) -> tuple[int, int, int]:
+    """Pale colour of a segment, from 0, on which dark tendons stand out."""
+    return _SEGMENTS[segment % len(_SEGMENTS)]
 
 
 def guide_segments(robot: Robot) -> Int[np.ndarray, " D"]:
@@ -134,10 +141,10 @@ def looks_by_tension(
         moving: Which ones move now; those have gaps.
     """
     share = np.clip(np.nan_to_num(tension) / most if most > 0 else 0 * tension, 0.0, 1.0)
-    stops = np.linspace(0.0, 1.0, len(_TENSION_COLOURS))
+    stops = np.linspace(0.0, 1.0, len(TENSION_COLOURS))
     looks = []
     for s, moves in zip(share, moving, strict=True):
-        r, g, b = (int(round(np.interp(s, stops, column))) for column in _TENSION_COLOURS.T)
+        r, g, b = (int(round(np.interp(s, stops, column))) for column in TENSION_COLOURS.T)
         looks.append(Look((r, g, b), 0.0010 + 0.0026 * float(s), bool(moves)))
     return tuple(looks)
 

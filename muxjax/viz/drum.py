@@ -15,11 +15,11 @@ from jaxtyping import Bool, Float
 
 from muxjax.robot import Robot
 
-RADIUS = 0.050  # of the drum, where the plugs end [m]
-LAYER = 0.042  # height of a layer [m]
-GAP = 0.014  # between a plug and the tip of the servo that faces it [m]
-PLUG = 0.012  # radius of a plug [m]
-SERVO = (0.040, 0.024, 0.024)  # box: outwards, sideways, up [m]
+RADIUS = 0.062  # of the drum, where the plugs end [m]
+LAYER = 0.052  # height of a layer [m]
+GAP = 0.018  # between a plug and the tip of the servo that faces it [m]
+PLUG = 0.015  # radius of a plug [m]
+SERVO = (0.048, 0.030, 0.030)  # box: outwards, sideways, up [m]
 
 
 @dataclass(frozen=True)
@@ -113,9 +113,7 @@ def facing(robot: Robot, slot: int) -> tuple[int, ...]:
     return tuple(int(c) for c in robot.axial_map[slot - 1])
 
 
-def shafts(
-    robot: Robot, slot: int, engaged: Bool[np.ndarray, " SJ"]
-) -> Float[np.ndarray, "n 2 3"]:
+def shafts(robot: Robot, slot: int, engaged: Bool[np.ndarray, " SJ"]) -> Float[np.ndarray, "n 2 3"]:
     """The bridges of engaged clutches, from a servo's tip to its plug [m]; none between slots."""
     if not slot:
         return np.zeros((0, 2, 3))
@@ -128,9 +126,7 @@ def shafts(
     return np.array([[tip, inward * tip] for tip in tips]).reshape(-1, 2, 3)
 
 
-def crosses(
-    robot: Robot, lost: Bool[np.ndarray, " J"], axial: float
-) -> Float[np.ndarray, "n 2 3"]:
+def crosses(robot: Robot, lost: Bool[np.ndarray, " J"], axial: float) -> Float[np.ndarray, "n 2 3"]:
     """An X through each failed servo, on its outer face and on top [m]."""
     x, y, z = (0.62 * size for size in SERVO)
     diagonals = np.array(

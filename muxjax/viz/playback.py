@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -161,8 +162,7 @@ def track_of_program(robot: Robot, program: Program, name: str) -> Track:
         if turned != axial[-1]:
             marks.append(Marks(waits, none, lost, f"{stage}: drum turns to {item.axial}"))
         marks.append(Marks(engage, engaged, lost, f"{stage}: clutches engage"))
-        what = ", ".join(str(c) for c in item.clutches)
-        marks.append(Marks(begin, engaged, lost, f"{stage}: tendons {what} move"))
+        marks.append(Marks(begin, engaged, lost, f"{stage}: {_move(item.clutches)}"))
         axial_s += [waits, engage]
         axial += [axial[-1], turned]
         point += len(item.via) + 1
@@ -286,8 +286,7 @@ def track_of_journal(robot: Robot, entries: list[Entry], name: str) -> Track:
                 axial_s.append(time_s - float(robot.engage_time))
                 positions.append(axial)
             engaged = np.isin(np.arange(1, n + 1), list(entry.goals))
-            names = ", ".join(str(c) for c in sorted(entry.goals))
-            phase = f"{stage}: tendons {names} move"
+            phase = f"{stage}: {_move(sorted(entry.goals))}"
         elif isinstance(entry, DoneEntry):
             engaged, phase = none, f"stage {entry.visit}: over"
         elif isinstance(entry, SessionEntry):
@@ -386,6 +385,11 @@ def _mark(robot: Robot, sensors: Sensors, now: float, marks: list[Marks]) -> Non
     last = marks[-1] if marks else None
     if last is None or last.phase != phase or np.any(last.lost != lost):
         marks.append(Marks(now if marks else 0.0, engaged, lost, phase))
+
+
+def _move(tendons: Sequence[int]) -> str:
+    names = ", ".join(map(str, tendons))
+    return f"tendon {names} moves" if len(tendons) == 1 else f"tendons {names} move"
 
 
 def _lost(robot: Robot, servos: tuple[int, ...]) -> Bool[np.ndarray, " J"]:

@@ -26,7 +26,7 @@ BY_STATE: dict[State, tuple[tuple[int, int, int], float, bool]] = {
 }
 # Slack to the tightest: lightness falls evenly (after matplotlib's cividis, turned round).
 TENSION_COLOURS = np.array(
-    [[253, 232, 100], [188, 175, 111], [123, 123, 119], [66, 78, 107], [0, 34, 78]], dtype=float
+    [[215, 195, 90], [165, 155, 110], [112, 114, 118], [60, 74, 108], [0, 34, 78]], dtype=float
 )
 # Okabe-Ito colours of segments as elsewhere, mixed with white, lighter from the base to the tip.
 _SEGMENTS = ((102, 170, 209), (240, 190, 153), (178, 226, 213), (240, 215, 229))
@@ -203,9 +203,7 @@ def tube_mesh(
         side = side - (side @ tangent) * tangent
         side /= np.linalg.norm(side)
         other = np.cross(tangent, side)
-        rings.append(
-            point + r * (np.cos(turn)[:, None] * side + np.sin(turn)[:, None] * other)
-        )
+        rings.append(point + r * (np.cos(turn)[:, None] * side + np.sin(turn)[:, None] * other))
     k = np.arange(sides)
     after = (k + 1) % sides
     faces = [

@@ -114,6 +114,10 @@ def open_viewer(browser: Chrome, viewer: Any, timeout_s: float = 60.0) -> None:
             log = "; ".join(str(entry["message"]) for entry in browser.get_log("browser")[-3:])
             raise TimeoutError(f"screenshot: the page was not there in {timeout_s:g} s: {log}")
         time.sleep(0.1)
+    time.sleep(1.0)
+    # viser warns that there is no GPU: known here, and in the way.
+    for cross in browser.find_elements("css selector", ".mantine-Notification-closeButton"):
+        cross.click()
     settle(browser)
 
 
@@ -161,7 +165,7 @@ def press(browser: Chrome, text: str) -> None:
     Raises:
         LookupError: There is none.
     """
-    for button in browser.find_elements("css selector", "button"):
+    for button in browser.find_elements("css selector", "button, [role=tab]"):
         if button.text.strip().lower() == text.lower() and button.is_displayed():
             button.click()
             return

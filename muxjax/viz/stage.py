@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from viser import SceneApi
 
 _DISC = 0.0026  # thickness of a drawn disc [m]
-_BESIDE = (-0.21, -0.13, -0.02)  # of the drum from the arm's root, in its frame [m]
+_BESIDE = (-0.21, -0.14, 0.0)  # of the drum from the arm's root, in its frame [m]
 _BLACK, _GREY, _RED = (25, 25, 25), (120, 120, 120), (190, 0, 30)
 _OBSTACLE = {"round": 0.75, "box": 0.6, "plane": 0.25, "tube": 0.22}  # opacity
 
@@ -101,6 +101,7 @@ class Stage:
             name, show_axes=False, position=centre, wxyz=quaternion(robot.base[:3, :3])
         )
         tall = drum.LAYER * robot.n_segments
+        self._top = tall - drum.LAYER / 2 + 0.045  # of the servos' names
         for layer in range(robot.n_segments):
             scene.add_cylinder(
                 f"{name}/layer{layer + 1}",
@@ -155,18 +156,16 @@ class Stage:
             )
             self._names.append(
                 scene.add_label(
-                    f"{name}/servo{s + 1}/name",
+                    f"{name}/name{s + 1}",
                     f"servo {s + 1}",
-                    position=(-0.01, 0.0, drum.SERVO[2] / 2 + 0.010),
                     font_size_mode="scene",
-                    font_scene_height=0.017,
+                    font_scene_height=0.018,
                     anchor="bottom-center",
                 )
             )
+        self._masts = scene.add_line_segments(f"{name}/masts", _no_lines(), _GREY, thickness=0.0015)
 
-    def draw(
-        self, moment: Moment, q: Float[np.ndarray, " dof"], looks: Sequence[Look]
-    ) -> None:
+    def draw(self, moment: Moment, q: Float[np.ndarray, " dof"], looks: Sequence[Look]) -> None:
         """Show a moment.
 
         Args:
@@ -193,17 +192,20 @@ class Stage:
         self._needles.points = drum.needles(robot, moment.displacements)
         axial = moment.axial
         known = axial is not None
+        masts = np.zeros((len(self._servos), 2, 3))
         for s, (box, label) in enumerate(zip(self._servos, self._names, strict=True)):
             place = drum.servo_place(robot, s, 0.0 if axial is None else axial)
             box.position, box.wxyz = place.frame[:3, 3], quaternion(place.frame[:3, :3])
             failed = bool(moment.lost[s])
-            turns = bool(moment.slot) and bool(
-                moment.moving[drum.facing(robot, moment.slot)[s]]
-            )
+            turns = bool(moment.slot) and bool(moment.moving[drum.facing(robot, moment.slot)[s]])
             box.color = (205, 205, 205) if failed else ((200, 70, 0) if turns else (70, 70, 70))
             state = " FAILED" if failed else (" turns" if turns else "")
             label.text = f"servo {s + 1}{state}"
+            # Above the drum, on a mast, no name is hidden by it.
+            label.position = place.frame[:3, 3] * [1, 1, 0] + (self._top + 0.002) * _UP
+            masts[s, 0], masts[s, 1] = place.frame[:3, 3], label.position
             box.visible = label.visible = known
+        self._masts.points, self._masts.visible = masts, known
         _set_lines(self._shafts, drum.shafts(robot, moment.slot, moment.engaged))
         _set_lines(
             self._crosses,
@@ -278,5 +280,6 @@ def add_ghosts(
         # Solutions meet at the tip and at the root: the numbers stand halfway.
         middle = line[len(line) // 2]
         text = f"solution {k + 1}" + (" (chosen)" if mine else "")
-        drawn += [tube, scene.add_label(f"/ghosts/{k + 1}/name", text, position=middle)]
+        scene.add_label(f"/ghosts/{k + 1}/name", text, position=middle)  # goes with its tube
+        drawn.append(tube)
     return drawn

@@ -6,10 +6,12 @@ solves for the target last dragged to, so that dragging never queues up.
 
 from __future__ import annotations
 
+import io
 import socket
 import threading
 import time
 from collections.abc import Callable, Sequence
+from contextlib import redirect_stdout
 from typing import Any
 
 import numpy as np
@@ -74,13 +76,14 @@ class Viewer:
         cloud: tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, " n"]] | None = None,
     ) -> None:
         self.desk, self.time_s, self.playing = desk, 0.0, False
-        self.server = viser.ViserServer(
-            host, free_port(host, port), label=f"muxjax: {desk.robot.config.name}", verbose=False
-        )
+        found = free_port(host, port)
+        with _hushed():
+            self.server = viser.ViserServer(
+                host, found, label=f"muxjax: {desk.robot.config.name}", verbose=False
+            )
         self._lock, self._quiet = threading.RLock(), False
         self._wanted: Float[np.ndarray, "4 4"] | None = None
         self._most = _TENSION_STEP
-        self._tension_now: tuple[float, int] = (0.0, 0)
         self._ghosts: list[Any] = []
         scene, robot = self.server.scene, desk.robot
         span = _APART * 1.5 * float(np.sum(robot.length))
@@ -89,7 +92,7 @@ class Viewer:
         self.right.root.visible = False
         self._add_surroundings(cloud)
         self._gizmo = scene.add_transform_controls(
-            "/target", scale=0.16, line_width=2.5, depth_test=False
+            "/target", scale=0.11, line_width=2.5, depth_test=False
         )
         self.panel = build_panel(self.server.gui, desk, method, colour, _PARTS)
         self._connect()
@@ -107,6 +110,14 @@ class Viewer:
     def _add_surroundings(self, cloud: Any) -> None:
         scene, robot, world = self.server.scene, self.desk.robot, self.desk.world
         scene.set_up_direction("+z")
+        # Even light without reflections or shadows: readable, and quick without a GPU too.
+        scene.configure_environment_map(None)
+        scene.configure_default_lights(False)
+        scene.add_light_ambient("/light/ambient", intensity=1.9)
+        for number, place in enumerate(((-1.0, -2.0, 3.0), (2.0, -1.0, 0.5), (0.0, 3.0, 1.0))):
+            scene.add_light_directional(
+                f"/light/{number}", position=place, intensity=(1.3, 0.6, 0.6)[number]
+            )
         self._parts: dict[str, Any] = {}
         self._parts["obstacles"] = scene.add_frame("/obstacles", show_axes=False)
         self._parts["workspace"] = scene.add_frame("/workspace", show_axes=False)
@@ -134,11 +145,13 @@ class Viewer:
     def _place_camera(self, span: float) -> None:
         base, size = self.desk.robot.base, float(np.sum(self.desk.robot.length))
         both = self.right.root.visible
-        look = base[:3, 3] + 0.42 * size * base[:3, 2] + np.array([0.5 * span * both, 0.0, 0.0])
-        camera = self.server.initial_camera
-        camera.look_at = look
-        camera.position = look + size * (2.0 + 0.9 * both) * np.array([-0.28, -0.9, 0.38])
-        camera.fov = float(np.radians(45))
+        look = base[:3, 3] + 0.41 * size * base[:3, 2]
+        look = look + np.array([0.5 * span * both + 0.16 * size, 0.0, 0.0])  # the panel is there
+        place = look + size * (2.1 + 0.8 * both) * np.array([-0.28, -0.9, 0.36])
+        clients = [client.camera for client in self.server.get_clients().values()]
+        for camera in (self.server.initial_camera, *clients):
+            camera.position, camera.look_at = place, look
+            camera.fov = float(np.radians(45))
 
     # Controls
 
@@ -175,7 +188,6 @@ class Viewer:
         """Have a control act, unless it was the viewer itself that changed it."""
 
         def react(_: Any) -> None:
-            # Asked before the lock: whoever sets a control holds the lock and calls from there.
             with self._lock:
                 if self._quiet:
                     return
@@ -420,7 +432,8 @@ class Viewer:
 
     def stop(self) -> None:
         """Close the server."""
-        self.server.stop()
+        with _hushed():
+            self.server.stop()
 
     # Drawing
 
@@ -479,6 +492,9 @@ class Viewer:
                 phase = track.at(self.time_s).phase
                 ends = f"{min(self.time_s, track.duration_s):.1f} of {track.duration_s:.1f} s"
                 lines.append(f"**{side}**: {track.name}, {ends}: {phase} ({track.kind})")
+        if self.panel.colour.value == "tension":
+            most = float(np.max(desk.tension(moment.displacements)))
+            lines.append(f"most tension {most:.0f} N (stiffness is assumed)")
         if self.shown_tracks[0] is None:
             place = f"drum at {moment.slot}" if moment.slot else "drum between two positions"
             lines.append(f"{place}: servos face tendons {_facing(desk, moment)}")
@@ -493,6 +509,11 @@ class Viewer:
             node.visible = shown[part]
         self._gizmo.visible = bool(self.panel.pose.value)
         self._show_solutions()
+
+
+def _hushed() -> redirect_stdout[io.StringIO]:
+    """viser prints when it starts and stops; standard output is the caller's."""
+    return redirect_stdout(io.StringIO())
 
 
 class _Silence:

@@ -102,7 +102,7 @@ def view(
         if xyz_mm is not None:
             viewer.aim(pose_argument(xyz_mm, rpy_deg, quat), beside)
         elif names:
-            viewer.show_tracks(*names[:2])
+            viewer.show_tracks(names[:2])
         viewer.seek(at_s)
         if screenshot is not None:
             from muxjax.viz.screenshot import take_screenshot
@@ -129,7 +129,7 @@ def _desk(
 ) -> Desk:
     from muxjax.planning.problem import preset_weights
     from muxjax.viz.desk import Desk
-    from muxjax.viz.playback import read_track
+    from muxjax.viz.recorded import read_track
 
     preset_weights(preset)  # a wrong name is refused before any work
     desk = Desk(arm, None if world is None else load_world(world), preset)

@@ -55,7 +55,7 @@ class Desk:
         self.q: Float[np.ndarray, " dof"] = np.zeros(2 * robot.n_segments)
         self.axial = 1
         self.failed: Bool[np.ndarray, " J"] = np.zeros(robot.tendons_per_segment, bool)
-        self.target: Float[np.ndarray, "4 4"] = forward_kinematics(robot, self.q)
+        self.target: Float[np.ndarray, "4 4"] = np.asarray(forward_kinematics(robot, self.q))
         self.solutions: Float[np.ndarray, "K dof"] = np.zeros((0, len(self.q)))
         self.chosen = 0
         self.tracks: dict[str, Track] = {}
@@ -72,7 +72,7 @@ class Desk:
     @property
     def tool(self) -> Float[np.ndarray, "4 4"]:
         """Pose of the tool now [m]."""
-        return forward_kinematics(self.robot, self.q)
+        return np.asarray(forward_kinematics(self.robot, self.q))
 
     @property
     def now(self) -> Moment:
@@ -89,7 +89,7 @@ class Desk:
             ValueError: A segment beyond its bending limit.
         """
         q = check_configuration(self.robot, np.radians(q_deg))
-        self.q, self.displacements = q, tendon_displacements(self.robot, q)
+        self.q, self.displacements = q, np.asarray(tendon_displacements(self.robot, q))
 
     def set_tendons_mm(self, lengths: Float[np.ndarray, " SJ"]) -> None:
         """Set tendons; the bending is what they define (M Eq. 4-5), as in the middle of a plan.
@@ -120,7 +120,7 @@ class Desk:
 
     def shape(self, displacements: Float[np.ndarray, " SJ"]) -> Float[np.ndarray, " dof"]:
         """Configuration [rad] of displacements; the present one where they define none."""
-        q = configuration_from_tendons(self.robot, displacements)
+        q = np.asarray(configuration_from_tendons(self.robot, displacements))
         return q if np.isfinite(q).all() else self.q
 
     def tension(self, displacements: Float[np.ndarray, " SJ"]) -> Float[np.ndarray, " SJ"]:

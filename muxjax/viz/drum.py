@@ -66,7 +66,7 @@ def layer_height(robot: Robot, tendon: int) -> float:
 
 
 def servo_angle(robot: Robot, servo: int, axial: float) -> float:
-    """Angle of a servo, from 0, about the drum's axis [rad]; ``axial`` from 0, fractions between."""
+    """Angle of a servo, from 0, about the drum's axis [rad], at a position from 0."""
     n_axial, n_servos = robot.axial_map.shape
     return 2 * np.pi * (axial / n_axial + servo / n_servos)
 

@@ -19,8 +19,10 @@ _PLANE = 0.7  # half the side of the square that stands for a half-space [m]
 _SECTORS = 24  # a symmetric sweep's half plane is turned so often, over half a turn
 _BOX = np.array(
     # Corners of ``product((-1, 1), repeat=3)``; two triangles a side, facing out.
-    [(0, 1, 3), (0, 3, 2), (4, 6, 7), (4, 7, 5), (0, 4, 5), (0, 5, 1)]
-    + [(2, 3, 7), (2, 7, 6), (0, 2, 6), (0, 6, 4), (1, 5, 7), (1, 7, 3)]
+    [
+        *((0, 1, 3), (0, 3, 2), (4, 6, 7), (4, 7, 5), (0, 4, 5), (0, 5, 1)),
+        *((2, 3, 7), (2, 7, 6), (0, 2, 6), (0, 6, 4), (1, 5, 7), (1, 7, 3)),
+    ]
 )
 
 
@@ -56,9 +58,9 @@ def solids(world: World, around: Float[np.ndarray, "3"]) -> list[Solid]:
         found.append(Solid("box", (corners - shift) @ turn, _BOX))
     for point, normal in zip(world.plane_point, world.plane_normal, strict=True):
         found.append(Solid("plane", *_square(np.asarray(point), np.asarray(normal), around)))
-    for line, bore, wall in zip(world.tube_line, world.tube_bore, world.tube_wall, strict=True):
-        for radius in (float(bore),) if wall is None else (float(bore), float(bore) + float(wall)):
-            found.append(Solid("tube", *tube_mesh(np.asarray(line), radius, 32)))
+    for through, bore, wall in zip(world.tube_line, world.tube_bore, world.tube_wall, strict=True):
+        radii_m = [float(bore)] if wall is None else [float(bore), float(bore) + float(wall)]
+        found += [Solid("tube", *tube_mesh(np.asarray(through), r, 32)) for r in radii_m]
     return found
 
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from muxjax.planning import METHODS
 from muxjax.viz.desk import Desk
-from muxjax.viz.scene import BY_STATE, TENSION_COLOURS
+from muxjax.viz.scene import BY_STATE, shades
 
 if TYPE_CHECKING:
     from viser import GuiApi
@@ -138,16 +138,17 @@ def legend_html(colour: str, most: float) -> str:
         colour: "state" or "tension".
         most: Tension of the darkest colour [N].
     """
+    rows: list[tuple[str, str, float, bool]]
     if colour == "state":
         rows = [
             (name, f"rgb{shade}", 1500 * thickness, dashed)
             for name, (shade, thickness, dashed) in BY_STATE.items()
         ]
     else:
-        shares = np.linspace(0.0, 1.0, len(TENSION_COLOURS))
+        shares = np.linspace(0.0, 1.0, 5)
         rows = [
-            (f"{most * s:.0f} N", f"rgb{tuple(int(x) for x in shade)}", 1.5 + 4 * s, False)
-            for s, shade in zip(shares, TENSION_COLOURS, strict=True)
+            (f"{most * s:.0f} N", f"rgb{tuple(shade.tolist())}", 1.5 + 4 * s, False)
+            for s, shade in zip(shares, shades(shares), strict=True)
         ]
         rows.append(("moves", "rgb(60, 60, 60)", 3.0, True))
     lines = "".join(

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Int, UInt8
 
 from muxjax.kinematics import backbone
 from muxjax.robot import Robot
@@ -24,8 +24,8 @@ BY_STATE: dict[State, tuple[tuple[int, int, int], float, bool]] = {
     "wound in": ((0, 80, 150), 0.0020, False),
     "paid out": ((225, 155, 0), 0.0020, True),
 }
-# Slack to the tightest: lightness falls evenly (after matplotlib's cividis, turned round).
-TENSION_COLOURS = np.array(
+# Of shares from 0 to 1: lightness falls evenly (after matplotlib's cividis, turned round).
+_SHADES = np.array(
     [[215, 195, 90], [165, 155, 110], [112, 114, 118], [60, 74, 108], [0, 34, 78]], dtype=float
 )
 # Okabe-Ito colours of segments as elsewhere, mixed with white, lighter from the base to the tip.
@@ -141,12 +141,16 @@ def looks_by_tension(
         moving: Which ones move now; those have gaps.
     """
     share = np.clip(np.nan_to_num(tension) / most if most > 0 else 0 * tension, 0.0, 1.0)
-    stops = np.linspace(0.0, 1.0, len(TENSION_COLOURS))
-    looks = []
-    for s, moves in zip(share, moving, strict=True):
-        r, g, b = (int(round(np.interp(s, stops, column))) for column in TENSION_COLOURS.T)
-        looks.append(Look((r, g, b), 0.0010 + 0.0026 * float(s), bool(moves)))
-    return tuple(looks)
+    return tuple(
+        Look((int(r), int(g), int(b)), 0.0010 + 0.0026 * float(s), bool(moves))
+        for s, (r, g, b), moves in zip(share, shades(share), moving, strict=True)
+    )
+
+
+def shades(shares: Float[np.ndarray, " n"]) -> UInt8[np.ndarray, "n 3"]:
+    """Colours of shares from 0, pale, to 1, dark."""
+    stops = np.linspace(0.0, 1.0, len(_SHADES))
+    return np.stack([np.interp(shares, stops, c) for c in _SHADES.T], axis=-1).astype(np.uint8)
 
 
 def strokes(points: Float[np.ndarray, "n 3"], *, dashed: bool) -> Float[np.ndarray, "m 2 3"]:

@@ -1,18 +1,16 @@
-"""One arm with its drive, and the things around it, drawn with viser."""
+"""One arm with its drive, drawn with viser."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
-from muxjax.collision import World
 from muxjax.robot import Robot
 from muxjax.viz import drum
-from muxjax.viz.obstacles import sampled_points, solids
 from muxjax.viz.playback import Moment
 from muxjax.viz.scene import (
     Look,
@@ -22,7 +20,6 @@ from muxjax.viz.scene import (
     segment_colour,
     strokes,
     tendon_points,
-    tube_mesh,
 )
 
 if TYPE_CHECKING:
@@ -31,7 +28,6 @@ if TYPE_CHECKING:
 _DISC = 0.0026  # thickness of a drawn disc [m]
 _BESIDE = (-0.21, -0.14, 0.0)  # of the drum from the arm's root, in its frame [m]
 _BLACK, _GREY, _RED = (25, 25, 25), (120, 120, 120), (190, 0, 30)
-_OBSTACLE = {"round": 0.75, "box": 0.6, "plane": 0.25, "tube": 0.22}  # opacity
 
 
 def quaternion(rotation: Float[np.ndarray, "*n 3 3"]) -> Float[np.ndarray, "*n 4"]:
@@ -54,6 +50,7 @@ class Stage:
         self, scene: SceneApi, robot: Robot, name: str, place: tuple[float, float, float]
     ) -> None:
         self._scene, self._robot, self._name = scene, robot, name
+        base = np.asarray(robot.base)
         self.root = scene.add_frame(name, show_axes=False, position=place)
         frames = guide_frames(robot, np.zeros(2 * robot.n_segments))
         self._paths = tendon_points(robot, frames)
@@ -62,7 +59,7 @@ class Stage:
         self.title = scene.add_label(
             f"{name}/title",
             "",
-            position=robot.base[:3, 3] + 1.16 * float(np.sum(robot.length)) * robot.base[:3, 2],
+            position=base[:3, 3] + 1.16 * float(np.sum(robot.length)) * base[:3, 2],
             anchor="bottom-center",
             visible=False,
         )
@@ -96,9 +93,10 @@ class Stage:
     def _add_drum(self) -> None:
         robot, scene = self._robot, self._scene
         name = f"{self._name}/drum"
-        centre = robot.base[:3, 3] + robot.base[:3, :3] @ np.array(_BESIDE)
+        base = np.asarray(robot.base)
+        centre = base[:3, 3] + base[:3, :3] @ np.array(_BESIDE)
         self.drum = scene.add_frame(
-            name, show_axes=False, position=centre, wxyz=quaternion(robot.base[:3, :3])
+            name, show_axes=False, position=centre, wxyz=quaternion(base[:3, :3])
         )
         tall = drum.LAYER * robot.n_segments
         self._top = tall - drum.LAYER / 2 + 0.045  # of the servos' names
@@ -205,7 +203,7 @@ class Stage:
             label.position = place.frame[:3, 3] * [1, 1, 0] + (self._top + 0.002) * _UP
             masts[s, 0], masts[s, 1] = place.frame[:3, 3], label.position
             box.visible = label.visible = known
-        self._masts.points, self._masts.visible = masts, known
+        self._masts.points, self._masts.visible = masts.astype(np.float32), known
         _set_lines(self._shafts, drum.shafts(robot, moment.slot, moment.engaged))
         _set_lines(
             self._crosses,
@@ -217,7 +215,7 @@ _UP = np.array([0.0, 0.0, 1.0])
 
 
 def _no_lines() -> Float[np.ndarray, "1 2 3"]:
-    """viser wants at least one piece."""
+    """A drawing of nothing: viser wants at least one piece."""
     return np.zeros((1, 2, 3))
 
 
@@ -225,61 +223,3 @@ def _set_lines(handle: Any, lines: Float[np.ndarray, "n 2 3"]) -> None:
     handle.visible = len(lines) > 0
     if len(lines):
         handle.points = lines
-
-
-def add_world(scene: SceneApi, robot: Robot, world: World, name: str) -> None:
-    """Draw a world's obstacles, pale enough to see the arm through them."""
-    for number, solid in enumerate(solids(world, robot.base[:3, 3]), start=1):
-        scene.add_mesh_simple(
-            f"{name}/{solid.kind}{number}",
-            solid.vertices,
-            solid.faces,
-            color=(130, 130, 140),
-            opacity=_OBSTACLE[solid.kind],
-            side="double",
-            flat_shading=solid.kind == "box",
-            cast_shadow=False,
-            receive_shadow=False,
-        )
-    points = sampled_points(world)
-    if len(points):
-        scene.add_point_cloud(f"{name}/sampled", points, (110, 110, 120), point_size=0.004)
-
-
-def add_ghosts(
-    scene: SceneApi,
-    robot: Robot,
-    solutions: Float[np.ndarray, "K dof"],
-    chosen: int,
-    on_click: Callable[[int], None],
-) -> list[Any]:
-    """Draw configurations as pale tubes, the chosen one darker and thicker, each with its number.
-
-    Args:
-        scene: Of the viser server.
-        robot: The arm.
-        solutions: Configurations [rad].
-        chosen: Which one is darker, from 0.
-        on_click: Called with the number, from 0, of one that was clicked.
-
-    Returns:
-        What was drawn, to be removed.
-    """
-    drawn: list[Any] = []
-    for k, q in enumerate(solutions):
-        line = guide_frames(robot, q)[:, :3, 3]
-        mine = k == chosen
-        tube = scene.add_mesh_simple(
-            f"/ghosts/{k + 1}",
-            *tube_mesh(line, 0.011 if mine else 0.007),
-            color=(0, 110, 80) if mine else (90, 90, 90),
-            opacity=0.5 if mine else 0.3,
-            cast_shadow=False,
-        )
-        tube.on_click(lambda _, k=k: on_click(k))
-        # Solutions meet at the tip and at the root: the numbers stand halfway.
-        middle = line[len(line) // 2]
-        text = f"solution {k + 1}" + (" (chosen)" if mine else "")
-        scene.add_label(f"/ghosts/{k + 1}/name", text, position=middle)  # goes with its tube
-        drawn.append(tube)
-    return drawn

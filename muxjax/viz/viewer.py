@@ -22,8 +22,16 @@ from scipy.spatial.transform import Rotation
 from muxjax.viz.desk import Desk
 from muxjax.viz.panel import BY_HAND, NOTHING, build_panel, legend_html
 from muxjax.viz.playback import Moment, Track
-from muxjax.viz.scene import TENSION_COLOURS, Look, looks_by_state, looks_by_tension, tendon_states
-from muxjax.viz.stage import Stage, add_ghosts, add_world, quaternion
+from muxjax.viz.scene import Look, looks_by_state, looks_by_tension, tendon_states
+from muxjax.viz.stage import Stage, quaternion
+from muxjax.viz.surroundings import (
+    add_cloud,
+    add_ghosts,
+    add_grid,
+    add_light,
+    add_world,
+    place_cameras,
+)
 
 _FRAME_S = 1 / 25
 _APART = 0.85  # of two arms side by side, in lengths of the arm and a half
@@ -99,7 +107,7 @@ class Viewer:
         self.refresh_tracks()
         self._move_gizmo(desk.target)
         self._sync()
-        self._place_camera(span)
+        place_cameras(self.server, robot, 0.0)
         self.say("Bend the arm, or drag the target and press Plan.")
 
     @property
@@ -110,48 +118,17 @@ class Viewer:
     def _add_surroundings(self, cloud: Any) -> None:
         scene, robot, world = self.server.scene, self.desk.robot, self.desk.world
         scene.set_up_direction("+z")
-        # Even light without reflections or shadows: readable, and quick without a GPU too.
-        scene.configure_environment_map(None)
-        scene.configure_default_lights(False)
-        scene.add_light_ambient("/light/ambient", intensity=1.9)
-        for number, place in enumerate(((-1.0, -2.0, 3.0), (2.0, -1.0, 0.5), (0.0, 3.0, 1.0))):
-            scene.add_light_directional(
-                f"/light/{number}", position=place, intensity=(1.3, 0.6, 0.6)[number]
-            )
-        self._parts: dict[str, Any] = {}
-        self._parts["obstacles"] = scene.add_frame("/obstacles", show_axes=False)
-        self._parts["workspace"] = scene.add_frame("/workspace", show_axes=False)
+        add_light(scene)
+        self._parts = {
+            part: scene.add_frame(f"/{part}", show_axes=False)
+            for part in ("obstacles", "workspace")
+        }
         if world is not None:
             add_world(scene, robot, world, "/obstacles")
         else:
-            scene.add_grid(
-                "/grid",
-                1.6,
-                1.6,
-                cell_size=0.1,
-                section_size=0.5,
-                position=robot.base[:3, 3] - np.array([0.0, 0.0, 0.06]),
-            )
+            add_grid(scene, robot)
         if cloud is not None:
-            points, shares = cloud
-            stops = np.linspace(0.0, 1.0, len(TENSION_COLOURS))
-            colours = np.stack(
-                [np.interp(shares, stops, c) for c in TENSION_COLOURS.T], axis=-1
-            ).astype(np.uint8)
-            scene.add_point_cloud(
-                "/workspace/points", points, colours, point_size=0.0025, point_shape="circle"
-            )
-
-    def _place_camera(self, span: float) -> None:
-        base, size = self.desk.robot.base, float(np.sum(self.desk.robot.length))
-        both = self.right.root.visible
-        look = base[:3, 3] + 0.41 * size * base[:3, 2]
-        look = look + np.array([0.5 * span * both + 0.16 * size, 0.0, 0.0])  # the panel is there
-        place = look + size * (2.1 + 0.8 * both) * np.array([-0.28, -0.9, 0.36])
-        clients = [client.camera for client in self.server.get_clients().values()]
-        for camera in (self.server.initial_camera, *clients):
-            camera.position, camera.look_at = place, look
-            camera.fov = float(np.radians(45))
+            add_cloud(scene, "/workspace/points", *cloud)
 
     # Controls
 
@@ -337,7 +314,7 @@ class Viewer:
             found.append(self.desk.plan(method))
             said.append(self.desk.last)
         self.refresh_tracks()
-        self.show_tracks(found[0].name, found[1].name if found[1:] else NOTHING)
+        self.show_tracks([track.name for track in found])
         self.say("; ".join(said) + ". Press Play.")
 
     # Time
@@ -351,13 +328,13 @@ class Viewer:
                 menu.options = (none, *names)
                 menu.value = kept if kept in menu.options else none
 
-    def show_tracks(self, left: str, right: str = NOTHING, time_s: float = 0.0) -> None:
-        """Put tracks on the timeline, by name."""
+    def show_tracks(self, names: Sequence[str]) -> None:
+        """Put one track on the timeline, or two side by side, by name."""
+        left, right = (*names, NOTHING)[:2]
         with self._lock:
             with self._silently():
                 self.panel.left.value, self.panel.right.value = left, right
             self._choose_tracks()
-            self.seek(time_s)
 
     @property
     def shown_tracks(self) -> tuple[Track | None, Track | None]:
@@ -376,7 +353,8 @@ class Viewer:
         self.playing = False
         if right != bool(self.right.root.visible):
             self.right.root.visible = right
-            self._place_camera(float(self.right.root.position[0]))
+            beside = float(self.right.root.position[0]) if right else 0.0
+            place_cameras(self.server, self.desk.robot, beside)
         self.seek(0.0)
 
     def seek(self, time_s: float) -> None:
@@ -512,7 +490,7 @@ class Viewer:
 
 
 def _hushed() -> redirect_stdout[io.StringIO]:
-    """viser prints when it starts and stops; standard output is the caller's."""
+    """Without what viser prints when it starts and stops: standard output is the caller's."""
     return redirect_stdout(io.StringIO())
 
 

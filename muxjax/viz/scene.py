@@ -19,7 +19,7 @@ State = Literal["held", "moving", "wound in", "paid out"]
 
 # Okabe-Ito colours; by lightness too they come in the order of the line's weight.
 BY_STATE: dict[State, tuple[tuple[int, int, int], float, bool]] = {
-    "held": ((150, 150, 150), 0.0010, False),
+    "held": ((190, 190, 190), 0.0013, False),
     "moving": ((200, 70, 0), 0.0042, False),
     "wound in": ((0, 80, 150), 0.0020, False),
     "paid out": ((225, 155, 0), 0.0020, True),

@@ -159,14 +159,19 @@ def take_screenshot(viewer: Any, path: Path, size: tuple[int, int], tab: str = "
         part.write_bytes(picture)
 
 
-def press(browser: Chrome, text: str) -> None:
-    """Click the button or tab with this text.
+def press(browser: Chrome, text: str, among: str = "[role=tab]") -> None:
+    """Click what has this text.
+
+    Args:
+        browser: With the page.
+        text: On it; capitals or not.
+        among: CSS selector of what may be clicked: the tabs, by default.
 
     Raises:
         LookupError: There is none.
     """
-    for button in browser.find_elements("css selector", "button, [role=tab]"):
+    for button in browser.find_elements("css selector", among):
         if button.text.strip().lower() == text.lower() and button.is_displayed():
             button.click()
             return
-    raise LookupError(f"no button {text!r} on the page")
+    raise LookupError(f"nothing to click with {text!r} on the page")

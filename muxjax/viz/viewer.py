@@ -218,6 +218,7 @@ class Viewer:
         with self._silently():
             self.panel.left.value = BY_HAND
             self.panel.right.value = NOTHING
+        self._lay_out()
         self._sync()
 
     # Target and plans
@@ -349,13 +350,17 @@ class Viewer:
         return max((t.duration_s for t in self.shown_tracks if t is not None), default=0.0)
 
     def _choose_tracks(self) -> None:
-        right = self.shown_tracks[1] is not None
         self.playing = False
+        self._lay_out()
+        self.seek(0.0)
+
+    def _lay_out(self) -> None:
+        """One arm, or two side by side."""
+        right = self.shown_tracks[1] is not None
         if right != bool(self.right.root.visible):
             self.right.root.visible = right
             beside = float(self.right.root.position[0]) if right else 0.0
             place_cameras(self.server, self.desk.robot, beside)
-        self.seek(0.0)
 
     def seek(self, time_s: float) -> None:
         """Go to a time [s] of the tracks that are shown."""

@@ -200,6 +200,7 @@ def test_clouds_lie_within_reach(arm, tmp_path):
     points = sampled_cloud(arm, 500)
     assert points.dtype == np.float32
     assert np.linalg.norm(points, axis=1).max() <= np.sum(arm.length) * (1 + 1e-5)
+    assert points[:, 1].min() >= 0  # the half behind the arm
     sweep = muxjax.sweep(arm, samples=1 << 17, cells=(8, 16))
     cells, dexterity = sweep_cloud(arm, sweep)
     assert np.all((dexterity >= 0) & (dexterity <= 1))

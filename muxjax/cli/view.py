@@ -162,7 +162,7 @@ def _cloud(arm: Robot, sweep: Path | None, sampled: bool) -> tuple[np.ndarray, n
     if not sampled:
         return None
     points = sampled_cloud(arm, _CLOUD_SAMPLES)
-    return points, np.full(len(points), 0.5)
+    return points, np.full(len(points), 0.3)
 
 
 def _viewer(desk: Desk, **options: Any) -> Viewer:

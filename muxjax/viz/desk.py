@@ -162,6 +162,23 @@ class Desk:
         self.solutions = found[:MOST_GHOSTS]
         return text
 
+    def aim_at_end_of(self, track: Track) -> bool:
+        """Put the target where a track's tool goes; whether that is another one than before.
+
+        Its solutions are not looked for: the track has its own.
+        """
+        end = track.at(track.duration_s).displacements if track.target is None else track.target
+        q = np.asarray(configuration_from_tendons(self.robot, end))
+        if not np.isfinite(q).all():
+            return False
+        pose = np.asarray(forward_kinematics(self.robot, q))
+        # A plan ends at its target but for the planner's tolerance.
+        if np.allclose(pose, self.target, atol=1e-4):
+            return False
+        self.target, self.chosen = pose, 0
+        self.solutions = np.zeros((0, len(q)))
+        return True
+
     def label(self, k: int) -> str:
         """A solution in words, from 0."""
         pairs = np.degrees(self.solutions[k]).reshape(-1, 2)

@@ -103,14 +103,17 @@ def _square(
 def sampled_cloud(robot: Robot, samples: int, seed: int = 0) -> Float[np.ndarray, "n 3"]:
     """Tool positions of random configurations [m], in float32 as the sweeps have them.
 
-    Uniform in the paper's coordinates, theta within its limits and phi in [0, 2 pi).
+    Uniform in the paper's coordinates, theta within its limits and phi in [0, 2 pi). Only the half
+    of positive y in the arm's base frame is kept, so that one sees inside.
     """
     rng = np.random.default_rng(seed)
     theta = rng.uniform(0.0, robot.theta_max, (samples, robot.n_segments))
     phi = rng.uniform(0.0, 2 * np.pi, (samples, robot.n_segments))
     q = np.stack([theta, phi], axis=-1).reshape(samples, -1)
     poses = forward_kinematics(robot, jnp.asarray(q, jnp.float32))
-    return np.array(poses[:, :3, 3], dtype=np.float32)
+    points = np.array(poses[:, :3, 3], dtype=np.float32)
+    beyond = (points - robot.base[:3, 3]) @ robot.base[:3, 1]
+    return points[beyond >= 0]
 
 
 def sweep_cloud(

@@ -9,6 +9,7 @@ import numpy as np
 
 from muxjax.planning import METHODS
 from muxjax.viz.desk import Desk
+from muxjax.viz.playback import Moment, Track
 from muxjax.viz.scene import BY_STATE, shades
 
 if TYPE_CHECKING:
@@ -86,8 +87,8 @@ def build_panel(gui: GuiApi, desk: Desk, method: str, colour: str, parts: tuple[
         axial = gui.add_slider("drum at", 1, len(robot.axial_map), 1, desk.axial)
     with tabs.add_tab("Plan"):
         pose = gui.add_checkbox("drag the target", True)
-        position = gui.add_vector3("x, y, z [mm]", (0.0, 0.0, 0.0), step=1.0)
-        turn = gui.add_vector3("roll, pitch, yaw [deg]", (0.0, 0.0, 0.0), step=1.0)
+        position = gui.add_vector3("x, y, z [mm]", (0.0, 0.0, 0.0), step=0.1)
+        turn = gui.add_vector3("roll, pitch, yaw [deg]", (0.0, 0.0, 0.0), step=0.1)
         to_tool = gui.add_button("target to the tool")
         solution = gui.add_dropdown("solution", ("none",))
         chosen = gui.add_dropdown("method", tuple(METHODS), initial_value=method)
@@ -162,6 +163,39 @@ def legend_html(colour: str, most: float) -> str:
 
 
 _DASHES = ' stroke-dasharray="6 5"'
+
+
+def readout(
+    desk: Desk,
+    moment: Moment,
+    tracks: tuple[Track | None, Track | None],
+    time_s: float,
+    colour: str,
+) -> str:
+    """Tool, tracks and drum in words.
+
+    Args:
+        desk: The arm and its target.
+        moment: Of the arm on the left.
+        tracks: On the left and on the right.
+        time_s: On the timeline [s].
+        colour: "state" or "tension".
+    """
+    x, y, z = 1e3 * desk.tool[:3, 3]
+    off = 1e3 * float(np.linalg.norm(desk.tool[:3, 3] - desk.target[:3, 3]))
+    lines = [f"tool at {x:.1f}, {y:.1f}, {z:.1f} mm; {off:.1f} mm from the target"]
+    for side, track in zip(("left", "right"), tracks, strict=True):
+        if track is not None:
+            phase = track.at(time_s).phase
+            ends = f"{min(time_s, track.duration_s):.1f} of {track.duration_s:.1f} s"
+            lines.append(f"**{side}**: {track.name}, {ends}: {phase} ({track.kind})")
+    if colour == "tension":
+        most = float(np.max(desk.tension(moment.displacements)))
+        lines.append(f"most tension {most:.0f} N (stiffness is assumed)")
+    if tracks[0] is None:
+        facing = ", ".join(str(c + 1) for c in desk.robot.axial_map[desk.axial - 1])
+        lines.append(f"drum at {desk.axial}: servos face tendons {facing}")
+    return "\n\n".join(lines)
 
 
 def _floor(value: float) -> float:

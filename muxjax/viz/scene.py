@@ -28,8 +28,15 @@ BY_STATE: dict[State, tuple[tuple[int, int, int], float, bool]] = {
 _SHADES = np.array(
     [[215, 195, 90], [165, 155, 110], [112, 114, 118], [60, 74, 108], [0, 34, 78]], dtype=float
 )
-# Okabe-Ito colours of segments as elsewhere, mixed with white, lighter from the base to the tip.
-_SEGMENTS = ((102, 170, 209), (240, 190, 153), (178, 226, 213), (240, 215, 229))
+# Okabe-Ito colours of segments as elsewhere, mixed with white, in the order of ``viz.programs``.
+_SEGMENTS = (
+    (102, 170, 209),
+    (240, 190, 153),
+    (178, 226, 213),
+    (240, 215, 229),
+    (245, 216, 140),
+    (204, 232, 250),
+)
 _AT_REST = 1e-4  # displacement from straight below which a tendon counts as held [m]
 
 

@@ -197,7 +197,7 @@ class Stage:
             failed = bool(moment.lost[s])
             turns = bool(moment.slot) and bool(moment.moving[drum.facing(robot, moment.slot)[s]])
             box.color = (205, 205, 205) if failed else ((200, 70, 0) if turns else (70, 70, 70))
-            state = " FAILED" if failed else (" turns" if turns else "")
+            state = ": out of use" if failed else (" turns" if turns else "")
             label.text = f"servo {s + 1}{state}"
             # Above the drum, on a mast, no name is hidden by it.
             label.position = place.frame[:3, 3] * [1, 1, 0] + (self._top + 0.002) * _UP

@@ -53,7 +53,7 @@ def add_cloud(
     scene: SceneApi, name: str, points: Float[np.ndarray, "n 3"], shares: Float[np.ndarray, " n"]
 ) -> None:
     """Draw a workspace: points [m], darker the nearer their share is to 1."""
-    scene.add_point_cloud(name, points, shades(shares), point_size=0.0025, point_shape="circle")
+    scene.add_point_cloud(name, points, shades(shares), point_size=0.0018)
 
 
 def add_world(scene: SceneApi, robot: Robot, world: World, name: str) -> None:

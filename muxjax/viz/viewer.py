@@ -6,23 +6,20 @@ solves for the target last dragged to, so that dragging never queues up.
 
 from __future__ import annotations
 
-import io
-import socket
 import threading
 import time
 from collections.abc import Callable, Sequence
-from contextlib import redirect_stdout
 from typing import Any
 
 import numpy as np
-import viser
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from muxjax.viz.desk import Desk
-from muxjax.viz.panel import BY_HAND, NOTHING, build_panel, legend_html
+from muxjax.viz.panel import BY_HAND, NOTHING, build_panel, legend_html, readout
 from muxjax.viz.playback import Moment, Track
 from muxjax.viz.scene import Look, looks_by_state, looks_by_tension, tendon_states
+from muxjax.viz.serving import start_server, stop_server
 from muxjax.viz.stage import Stage, quaternion
 from muxjax.viz.surroundings import (
     add_cloud,
@@ -37,25 +34,6 @@ _FRAME_S = 1 / 25
 _APART = 0.85  # of two arms side by side, in lengths of the arm and a half
 _TENSION_STEP = 50.0  # the darkest colour's tension is a multiple of it [N]
 _PARTS = ("discs", "drum", "IK solutions", "obstacles", "workspace")
-
-
-def free_port(host: str, port: int) -> int:
-    """The port itself if nobody has it, or any free one for 0.
-
-    Raises:
-        ValueError: Another program has it, or it cannot be had.
-    """
-    with socket.socket() as probe:
-        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        try:
-            probe.bind((host, port))
-        except (OSError, OverflowError) as error:
-            why = error.strerror if isinstance(error, OSError) else str(error)
-            raise ValueError(
-                f"port: {host}:{port} cannot be had ({why}); is another viewer open? Close it or "
-                "give another --port"
-            ) from None
-        return int(probe.getsockname()[1])
 
 
 class Viewer:
@@ -84,11 +62,7 @@ class Viewer:
         cloud: tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, " n"]] | None = None,
     ) -> None:
         self.desk, self.time_s, self.playing = desk, 0.0, False
-        found = free_port(host, port)
-        with _hushed():
-            self.server = viser.ViserServer(
-                host, found, label=f"muxjax: {desk.robot.config.name}", verbose=False
-            )
+        self.server = start_server(host, port, f"muxjax: {desk.robot.config.name}")
         self._lock, self._quiet = threading.RLock(), False
         self._wanted: Float[np.ndarray, "4 4"] | None = None
         self._most = _TENSION_STEP
@@ -352,6 +326,10 @@ class Viewer:
     def _choose_tracks(self) -> None:
         self.playing = False
         self._lay_out()
+        left = self.shown_tracks[0]
+        if left is not None and self.desk.aim_at_end_of(left):
+            self._move_gizmo(self.desk.target)
+            self._show_solutions()
         self.seek(0.0)
 
     def _lay_out(self) -> None:
@@ -415,8 +393,7 @@ class Viewer:
 
     def stop(self) -> None:
         """Close the server."""
-        with _hushed():
-            self.server.stop()
+        stop_server(self.server)
 
     # Drawing
 
@@ -454,7 +431,9 @@ class Viewer:
                 self.right.title.text, self.right.title.visible = right.name, True
             p.time.value = min(round(self.time_s, 2), p.time.max)
             p.legend.content = legend_html(p.colour.value, self._most)
-            p.readout.content = self._readout(moment)
+            p.readout.content = readout(
+                desk, moment, self.shown_tracks, self.time_s, p.colour.value
+            )
 
     def _looks(self, moment: Moment) -> Sequence[Look]:
         if self.panel.colour.value == "state":
@@ -463,25 +442,6 @@ class Viewer:
         most = float(np.max(tension, initial=0.0))
         self._most = max(self._most, _TENSION_STEP * np.ceil(most / _TENSION_STEP))
         return looks_by_tension(tension, self._most, moment.moving)
-
-    def _readout(self, moment: Moment) -> str:
-        desk = self.desk
-        tool = desk.tool
-        x, y, z = 1e3 * tool[:3, 3]
-        off = 1e3 * float(np.linalg.norm(tool[:3, 3] - desk.target[:3, 3]))
-        lines = [f"tool at {x:.1f}, {y:.1f}, {z:.1f} mm; {off:.1f} mm from the target"]
-        for side, track in zip(("left", "right"), self.shown_tracks, strict=True):
-            if track is not None:
-                phase = track.at(self.time_s).phase
-                ends = f"{min(self.time_s, track.duration_s):.1f} of {track.duration_s:.1f} s"
-                lines.append(f"**{side}**: {track.name}, {ends}: {phase} ({track.kind})")
-        if self.panel.colour.value == "tension":
-            most = float(np.max(desk.tension(moment.displacements)))
-            lines.append(f"most tension {most:.0f} N (stiffness is assumed)")
-        if self.shown_tracks[0] is None:
-            place = f"drum at {moment.slot}" if moment.slot else "drum between two positions"
-            lines.append(f"{place}: servos face tendons {_facing(desk, moment)}")
-        return "\n\n".join(lines)
 
     def _show_parts(self) -> None:
         shown = {part: bool(box.value) for part, box in self.panel.shown.items()}
@@ -492,11 +452,6 @@ class Viewer:
             node.visible = shown[part]
         self._gizmo.visible = bool(self.panel.pose.value)
         self._show_solutions()
-
-
-def _hushed() -> redirect_stdout[io.StringIO]:
-    """Without what viser prints when it starts and stops: standard output is the caller's."""
-    return redirect_stdout(io.StringIO())
 
 
 class _Silence:
@@ -512,9 +467,3 @@ class _Silence:
     def __exit__(self, *_: object) -> None:
         self._viewer._quiet = self._before
         self._viewer._lock.release()
-
-
-def _facing(desk: Desk, moment: Moment) -> str:
-    if not moment.slot:
-        return "none"
-    return ", ".join(str(c + 1) for c in desk.robot.axial_map[moment.slot - 1])

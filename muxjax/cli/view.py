@@ -86,10 +86,11 @@ def view(
         raise ValueError("view: --beside is of the plan to --xyz-mm")
     if screenshot is not None and screenshot.suffix != ".png":
         raise ValueError(f"screenshot: must end in .png, found {screenshot}")
+    make_viewer = _viewer_class()
     arm = load_robot(robot)
     desk = _desk(arm, files, q_deg, servos, preset, world)
     points = _cloud(arm, sweep, cloud)
-    viewer = _viewer(
+    viewer = make_viewer(
         desk,
         host=host,
         port=0 if screenshot is not None else port,
@@ -165,11 +166,11 @@ def _cloud(arm: Robot, sweep: Path | None, sampled: bool) -> tuple[np.ndarray, n
     return points, np.full(len(points), 0.3)
 
 
-def _viewer(desk: Desk, **options: Any) -> Viewer:
+def _viewer_class() -> type[Viewer]:
     try:
         from muxjax.viz.viewer import Viewer
     except ImportError as error:
         raise ValueError(
             f"view: needs {error.name}, which is not installed: pip install 'muxjax[viz]'"
         ) from None
-    return Viewer(desk, **options)
+    return Viewer

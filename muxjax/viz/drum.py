@@ -119,7 +119,7 @@ def shafts(robot: Robot, slot: int, engaged: Bool[np.ndarray, " SJ"]) -> Float[n
         return np.zeros((0, 2, 3))
     inward = np.array([RADIUS / (RADIUS + GAP), RADIUS / (RADIUS + GAP), 1.0])
     tips = [
-        servo_place(robot, servo, slot - 1).tip
+        servo_place(robot, servo, float(slot - 1)).tip
         for servo, tendon in enumerate(facing(robot, slot))
         if engaged[tendon]
     ]

@@ -99,7 +99,7 @@ class Stage:
             name, show_axes=False, position=centre, wxyz=quaternion(base[:3, :3])
         )
         tall = drum.LAYER * robot.n_segments
-        self._top = tall - drum.LAYER / 2 + 0.045  # of the servos' names
+        self._top = tall - drum.LAYER / 2 + 0.095  # of the servos' names
         for layer in range(robot.n_segments):
             scene.add_cylinder(
                 f"{name}/layer{layer + 1}",
@@ -196,7 +196,7 @@ class Stage:
             box.position, box.wxyz = place.frame[:3, 3], quaternion(place.frame[:3, :3])
             failed = bool(moment.lost[s])
             turns = bool(moment.slot) and bool(moment.moving[drum.facing(robot, moment.slot)[s]])
-            box.color = (205, 205, 205) if failed else ((200, 70, 0) if turns else (70, 70, 70))
+            box.color = (115, 115, 115) if failed else ((200, 70, 0) if turns else (70, 70, 70))
             state = ": out of use" if failed else (" turns" if turns else "")
             label.text = f"servo {s + 1}{state}"
             # Above the drum, on a mast, no name is hidden by it.

@@ -34,8 +34,8 @@ def place_cameras(server: ViserServer, robot: Robot, beside: float) -> None:
     """Have everybody look at the arm, or at two of them that stand ``beside`` each other [m]."""
     base, size = np.asarray(robot.base), float(np.sum(robot.length))
     look = base[:3, 3] + 0.41 * size * base[:3, 2]
-    look = look + np.array([0.5 * beside + 0.16 * size, 0.0, 0.0])  # the panel covers the right
-    place = look + size * (2.9 if beside else 2.1) * np.array([-0.28, -0.9, 0.36])
+    look = look + np.array([0.62 * beside + 0.16 * size, 0.0, 0.0])  # the panel covers the right
+    place = look + size * (3.0 if beside else 2.1) * np.array([-0.28, -0.9, 0.36])
     cameras: list[Any] = [client.camera for client in server.get_clients().values()]
     for camera in (server.initial_camera, *cameras):
         camera.position, camera.look_at = place, look

@@ -384,6 +384,19 @@ def test_all_solutions_are_found_and_the_chosen_one_is_planned_to(arm):
     ]
 
 
+def test_solutions_in_collision_are_left_out(arm):
+    world = load_world("cabinet")
+    desk = Desk(arm, world)
+    blocked = np.radians([100.0, 0.0, 0.0, 0.0, 0.0, 0.0])
+    assert muxjax.clearance(arm, blocked, world) < 0
+    with pytest.raises(ValueError, match="all collide; move the target"):
+        desk.solve(muxjax.forward_kinematics(arm, blocked))
+    assert not len(desk.solutions)
+    desk.solve(muxjax.forward_kinematics(arm, Q))
+    assert len(desk.solutions)
+    assert np.all(np.asarray(muxjax.clearance(arm, desk.solutions, world)) > 0)
+
+
 # The controls, without a browser
 
 
@@ -471,6 +484,19 @@ def test_plan_play_and_compare(arm, viewer):
     panel.angles[0].value = 12.0  # by hand again
     assert (panel.left.value, panel.right.value) == (BY_HAND, NOTHING)
     assert not viewer.right.root.visible
+
+
+def test_aiming_says_what_is_refused(arm, viewer):
+    far = np.eye(4)
+    far[:3, 3] = 0.0, 0.0, 2.0
+    assert "not reached" in viewer.aim(far)
+    viewer.panel.failed[0].value = viewer.panel.failed[1].value = True
+    viewer.panel.failed[2].value = True
+    assert "every servo is marked" in viewer.aim(muxjax.forward_kinematics(arm, Q))
+    assert viewer.shown_tracks == (None, None)
+    viewer.panel.failed[2].value = False
+    assert viewer.aim(muxjax.forward_kinematics(arm, Q), "greedy") == ""
+    assert [t.name[:6] for t in viewer.shown_tracks] == ["exact,", "greedy"]
 
 
 def test_parts_can_be_hidden_and_tension_shown(viewer):

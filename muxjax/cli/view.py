@@ -87,6 +87,10 @@ def view(
     if screenshot is not None and screenshot.suffix != ".png":
         raise ValueError(f"screenshot: must end in .png, found {screenshot}")
     make_viewer = _viewer_class()
+    if screenshot is not None:
+        from muxjax.viz.screenshot import find_browser, take_screenshot
+
+        find_browser()  # what is missing is said before any work
     arm = load_robot(robot)
     desk = _desk(arm, files, q_deg, servos, preset, world)
     points = _cloud(arm, sweep, cloud)
@@ -101,13 +105,13 @@ def view(
     try:
         names = list(desk.tracks)
         if xyz_mm is not None:
-            viewer.aim(pose_argument(xyz_mm, rpy_deg, quat), beside)
+            refusal = viewer.aim(pose_argument(xyz_mm, rpy_deg, quat), beside)
+            if refusal:
+                notice(f"muxjax: {refusal}")  # the page says so too, and can mend it
         elif names:
             viewer.show_tracks(names[:2])
         viewer.seek(at_s)
         if screenshot is not None:
-            from muxjax.viz.screenshot import take_screenshot
-
             take_screenshot(viewer, screenshot, size, tab)
             console.print(f"{screenshot} written")
             return 0
@@ -159,7 +163,8 @@ def _cloud(arm: Robot, sweep: Path | None, sampled: bool) -> tuple[np.ndarray, n
     if sweep is not None:
         if sampled:
             raise ValueError("view: give either --sweep or --cloud")
-        return sweep_cloud(arm, load_sweep(sweep))
+        points, dexterity = sweep_cloud(arm, load_sweep(sweep))
+        return points, dexterity / max(float(dexterity.max()), 1e-9)  # the best cell is darkest
     if not sampled:
         return None
     points = sampled_cloud(arm, _CLOUD_SAMPLES)

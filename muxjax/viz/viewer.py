@@ -204,14 +204,17 @@ class Viewer:
         pose[:3, 3] = position
         self._wanted = pose
 
-    def solve(self, pose: Float[np.ndarray, "4 4"]) -> None:
-        """All solutions of a target, drawn; a refusal is shown."""
+    def solve(self, pose: Float[np.ndarray, "4 4"]) -> str:
+        """All solutions of a target, drawn; a refusal is shown, and returned."""
+        refusal = ""
         with self._lock:
             try:
                 self.say(self.desk.solve(pose) + ".")
             except ValueError as error:
-                self.warn(str(error))
+                refusal = str(error)
+                self.warn(refusal)
             self._show_solutions()
+        return refusal
 
     def _show_solutions(self) -> None:
         desk, p = self.desk, self.panel
@@ -256,24 +259,29 @@ class Viewer:
     def _move_gizmo(self, pose: Float[np.ndarray, "4 4"]) -> None:
         self._gizmo.position, self._gizmo.wxyz = pose[:3, 3], quaternion(pose[:3, :3])
 
-    def aim(self, pose: Float[np.ndarray, "4 4"], beside: str | None) -> None:
-        """Put the target somewhere and plan to it; what is refused is shown.
+    def aim(self, pose: Float[np.ndarray, "4 4"], beside: str | None = None) -> str:
+        """Put the target somewhere and plan to it.
 
         Args:
             pose: Of the target [m].
             beside: Method of the plan on the right; None for no such plan.
+
+        Returns:
+            What was refused and why, which is shown too; empty if nothing.
         """
         with self._lock:
             self._move_gizmo(pose)
-            self.solve(pose)
-            if not len(self.desk.solutions):
-                return
+            refusal = self.solve(pose)
+            if refusal:
+                return refusal
             with self._silently():
                 self.panel.beside.value = beside or NOTHING
             try:
                 self.make_plan()
             except ValueError as error:
                 self.warn(str(error))
+                return str(error)
+            return ""
 
     def make_plan(self) -> None:
         """Plan to the chosen solution by one method, or by two side by side, from the same start.

@@ -452,6 +452,19 @@ def test_dragging_solves_for_the_last_place_only(arm, viewer):
     assert viewer.panel.solution.value == "none"
 
 
+def test_a_position_alone_is_reached_where_the_pose_is_not(arm, viewer):
+    viewer.drag((0.04, 0.0, 0.465), (1.0, 0.0, 0.0, 0.0))
+    viewer.tick(0.0)
+    assert "not reached" in viewer.panel.status.content
+    viewer.panel.goal.value = "position"
+    assert "configurations reach the target (there may be more)" in viewer.panel.status.content
+    assert 1 < len(viewer.desk.solutions) <= 8
+    tools = muxjax.forward_kinematics(arm, viewer.desk.solutions)
+    np.testing.assert_allclose(
+        tools[:, :3, 3], np.tile([0.04, 0.0, 0.465], (len(tools), 1)), atol=1e-9
+    )
+
+
 def test_plan_play_and_compare(arm, viewer):
     panel, pose = viewer.panel, muxjax.forward_kinematics(arm, Q)
     panel.failed[1].value = True
@@ -527,6 +540,7 @@ def test_a_taken_port_is_said(arm):
         (["--rpy-deg", "0", "0", "0"], "only --xyz-mm takes"),
         (["--beside", "greedy"], "--beside is of the plan"),
         (["--screenshot", "arm.jpg"], "must end in .png"),
+        (["--size", "10", "10"], "must be 200 to 4000 pixels, found (10, 10)"),
         (["--world", "nowhere"], "no 'nowhere' among the shipped"),
         (["--preset", "nowhere"], "no 'nowhere' among the shipped"),
     ],

@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from muxjax.viz.viewer import Viewer
 
 _CLOUD_SAMPLES = 20_000
+_PIXELS = 200, 4000  # least and most of a picture's sides
 
 
 def view(
@@ -86,6 +87,8 @@ def view(
         raise ValueError("view: --beside is of the plan to --xyz-mm")
     if screenshot is not None and screenshot.suffix != ".png":
         raise ValueError(f"screenshot: must end in .png, found {screenshot}")
+    if not all(_PIXELS[0] <= pixels <= _PIXELS[1] for pixels in size):
+        raise ValueError(f"size: must be {_PIXELS[0]} to {_PIXELS[1]} pixels, found {size}")
     make_viewer = _viewer_class()
     if screenshot is not None:
         from muxjax.viz.screenshot import find_browser, take_screenshot
@@ -102,6 +105,7 @@ def view(
         colour=colour,
         cloud=points,
     )
+    refusal = ""
     try:
         names = list(desk.tracks)
         if xyz_mm is not None:
@@ -114,7 +118,7 @@ def view(
         if screenshot is not None:
             take_screenshot(viewer, screenshot, size, tab)
             console.print(f"{screenshot} written")
-            return 0
+            return 1 if refusal else 0
         console.print(f"{viewer.url}   (Ctrl-C ends)")
         viewer.run()
     except KeyboardInterrupt:

@@ -26,6 +26,12 @@ from muxjax.tendons import (
 from muxjax.viz.playback import Moment, Track, still, track_of_program
 
 MOST_GHOSTS = 8
+# What of the target counts, as weights of ``ik.all_ik``.
+GOALS = {
+    "pose": (1.0, 1.0, 1.0, 1.0, 1.0, 1.0),
+    "position and z axis": (1.0, 1.0, 1.0, 1.0, 1.0, 0.0),
+    "position": (1.0, 1.0, 1.0, 0.0, 0.0, 0.0),
+}
 
 
 class Desk:
@@ -43,6 +49,7 @@ class Desk:
         axial: Axial position now, from 1.
         failed: Servos that cannot be used.
         target: Pose wanted [m].
+        goal: What of it counts: a key of ``GOALS``.
         solutions: Configurations that reach it [rad], at most ``MOST_GHOSTS``.
         chosen: Which of them the plan goes to, from 0.
         tracks: By name, in the order in which they came.
@@ -56,6 +63,7 @@ class Desk:
         self.axial = 1
         self.failed: Bool[np.ndarray, " J"] = np.zeros(robot.tendons_per_segment, bool)
         self.target: Float[np.ndarray, "4 4"] = np.asarray(forward_kinematics(robot, self.q))
+        self.goal = "pose"
         self.solutions: Float[np.ndarray, "K dof"] = np.zeros((0, len(self.q)))
         self.chosen = 0
         self.tracks: dict[str, Track] = {}
@@ -136,17 +144,23 @@ class Desk:
         return tuple(int(s) + 1 for s in np.flatnonzero(~self.failed))
 
     def solve(self, pose: Float[np.ndarray, "4 4"]) -> str:
-        """All configurations that reach a pose; what was found, in words.
+        """Configurations that reach a pose, or what of it counts; what was found, in words.
+
+        Of a whole pose these are all (three segments); of a part, representatives, the
+        least bent first.
 
         Raises:
             ValueError: None reaches it; the message says how far off the closest is.
         """
         self.target, self.chosen = np.asarray(pose, float), 0
         self.solutions = np.zeros((0, 2 * self.robot.n_segments))
-        every = all_ik(self.robot, self.target, project_rotations=True)
+        weights = GOALS[self.goal]
+        every = all_ik(self.robot, self.target, weights=weights, project_rotations=True)
         found = np.asarray(every.q)[np.asarray(every.mask)]
         if not len(found):
-            nearest = solve_ik(self.robot, self.target, q0=self.q, project_rotations=True)
+            nearest = solve_ik(
+                self.robot, self.target, q0=self.q, weights=weights, project_rotations=True
+            )
             self.solutions = np.asarray(nearest.check().q)[None]
             return "one configuration reaches the target"
         text = f"{len(found)} configuration{'s reach' if len(found) > 1 else ' reaches'} the target"

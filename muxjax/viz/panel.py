@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from muxjax.planning import METHODS
-from muxjax.viz.desk import Desk
+from muxjax.viz.desk import GOALS, Desk
 from muxjax.viz.playback import Moment, Track
 from muxjax.viz.scene import BY_STATE, shades
 
@@ -35,6 +35,7 @@ class Panel:
     pose: Any
     position: Any
     turn: Any
+    goal: Any
     to_tool: Any
     solution: Any
     method: Any
@@ -89,6 +90,7 @@ def build_panel(gui: GuiApi, desk: Desk, method: str, colour: str, parts: tuple[
         pose = gui.add_checkbox("drag the target", True)
         position = gui.add_vector3("x, y, z [mm]", (0.0, 0.0, 0.0), step=0.1)
         turn = gui.add_vector3("roll, pitch, yaw [deg]", (0.0, 0.0, 0.0), step=0.1)
+        goal = gui.add_dropdown("what counts", tuple(GOALS), initial_value=desk.goal)
         to_tool = gui.add_button("target to the tool")
         solution = gui.add_dropdown("solution", ("none",))
         chosen = gui.add_dropdown("method", tuple(METHODS), initial_value=method)
@@ -116,6 +118,7 @@ def build_panel(gui: GuiApi, desk: Desk, method: str, colour: str, parts: tuple[
         pose=pose,
         position=position,
         turn=turn,
+        goal=goal,
         to_tool=to_tool,
         solution=solution,
         method=chosen,

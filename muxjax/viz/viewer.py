@@ -120,6 +120,7 @@ class Viewer:
         self._on(p.pose, self._show_parts)
         for typed in (p.position, p.turn):
             self._on(typed, self._type_target)
+        self._on(p.goal, self._change_goal)
         self._on(p.to_tool, self._target_to_tool)
         self._on(p.solution, self._pick)
         self._on(p.plan, self.make_plan)
@@ -251,6 +252,10 @@ class Viewer:
         pose[:3, :3] = Rotation.from_euler("xyz", self.panel.turn.value, degrees=True).as_matrix()
         self._move_gizmo(pose)
         self.solve(pose)
+
+    def _change_goal(self) -> None:
+        self.desk.goal = self.panel.goal.value
+        self.solve(self.desk.target)
 
     def _target_to_tool(self) -> None:
         self._move_gizmo(self.desk.tool)

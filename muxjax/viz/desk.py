@@ -9,12 +9,13 @@ import jax
 import numpy as np
 from jaxtyping import Bool, Float
 
-from muxjax.collision import World, clearance
+from muxjax.collision import World
 from muxjax.ik import all_ik, solve_ik
 from muxjax.kinematics import check_configuration, forward_kinematics
 from muxjax.metrics import evaluate
 from muxjax.planning import METHODS, PlanningError, Problem, Tension
 from muxjax.planning import plan as plan_steps
+from muxjax.planning.world import clearance_of
 from muxjax.robot import Robot
 from muxjax.scheduler import schedule
 from muxjax.tendons import (
@@ -167,8 +168,8 @@ class Desk:
         if not bool(every.complete):
             text += " (there may be more)"
         if self.world is not None:
-            with jax.enable_x64(True):
-                clear = np.asarray(clearance(self.robot, found, self.world)) > 0
+            lengths = np.asarray(tendon_displacements(self.robot, found))
+            clear = np.array([clearance_of(self.robot, row, self.world) > 0 for row in lengths])
             if not clear.any():
                 raise ValueError(f"target: {text}, but all collide; move the target")
             text += f", {int(clear.sum())} clear of obstacles" if not clear.all() else ""

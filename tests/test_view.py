@@ -13,8 +13,10 @@ import muxjax
 from muxjax.cli import main
 from muxjax.collision import load_world
 from muxjax.hardware import Journal, LockstepLink
+from muxjax.hardware.faults import FaultConfig
 from muxjax.hardware.log import LoggedLink
 from muxjax.metrics.program import timeline
+from muxjax.pipeline import run_to_target
 from muxjax.plan_file import save_plan
 from muxjax.planning.world import clearance_of
 from muxjax.program_file import save_program
@@ -305,6 +307,27 @@ def test_a_journal_plays_the_run_without_being_touched(arm, program, recorded):
     np.testing.assert_allclose(track.target, program.target)
     moving = [m for m in track.marks if m.phase.endswith(("move", "moves"))]
     assert len(moving) >= len(program.instructions)
+
+
+def test_a_servo_that_dies_in_a_run_is_out_of_use_from_then_on(arm, program, tmp_path):
+    # The journal of a run that went on without servo 3, and the log of both its parts.
+    dies = FaultConfig(kind="servo_offline", index=3, at_op="START", nth=2, delay_s=0.4)
+    link = LoggedLink(LockstepLink(arm, faults=[dies], stream_divider=5), tmp_path / "run.log")
+    with Journal.open(tmp_path / "run.journal") as journal:
+        run = run_to_target(link, journal, program)
+    link.close()
+    assert run.completed
+    for name in ("run.journal", "run.log"):
+        track = read_track(arm, tmp_path / name)
+        lost = [bool(mark.lost[2]) for mark in track.marks]
+        assert not lost[0], name
+        assert lost[-1], name
+        first = lost.index(True)
+        assert all(lost[first:]), name
+        end = track.at(track.duration_s)
+        np.testing.assert_allclose(end.displacements, program.target, atol=5e-5)
+        later = track.at((track.marks[first].since_s + track.duration_s) / 2)
+        assert later.lost[2], name
 
 
 def test_files_that_cannot_be_played_say_why(arm, program, recorded, tmp_path):

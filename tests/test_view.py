@@ -6,6 +6,7 @@ import socket
 import time
 from itertools import pairwise
 
+import equinox as eqx
 import numpy as np
 import pytest
 
@@ -72,6 +73,9 @@ def test_discs_stand_on_the_backbone_at_equal_distances(robot, rng):
 
 
 def test_tendons_pass_the_guides_at_r_and_are_as_long_as_eq_6_says(robot, rng):
+    # Any routing, not only straight along the arm.
+    azimuth = robot.tendon_azimuth + rng.uniform(0.0, 1.0, robot.tendon_azimuth.shape)
+    robot = eqx.tree_at(lambda r: r.tendon_azimuth, robot, azimuth)
     q = random_configurations(robot, rng)
     frames, of = scene.guide_frames(robot, q), scene.guide_segments(robot)
     paths = scene.tendon_points(robot, frames)
@@ -349,6 +353,7 @@ def test_files_that_cannot_be_played_say_why(arm, program, recorded, tmp_path):
         (arm, "bad.npz", "not a trajectory"),
         (arm, "damaged.journal", "line 1: checksum"),
         (penta, recorded[0] / "run.journal", "made for robot 'muxarm'"),
+        (penta, recorded[0] / "run.log", "a program of another robot; this is 'penta'"),
     ):
         with pytest.raises(ValueError, match=why):
             read_track(robot, tmp_path / name)

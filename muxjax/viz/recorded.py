@@ -21,7 +21,15 @@ from muxjax.hardware.journal import (
     SessionEntry,
     read_entries,
 )
-from muxjax.hardware.protocol import OFFLINE, STALLED, Frame, Port, Received
+from muxjax.hardware.protocol import (
+    OFFLINE,
+    STALLED,
+    Frame,
+    Op,
+    Port,
+    Received,
+    fingerprint_words,
+)
 from muxjax.hardware.sensors import Sensors
 from muxjax.plan_file import load_plan
 from muxjax.program_file import load_program
@@ -166,17 +174,26 @@ def track_of_log(robot: Robot, path: str | Path) -> Track:
     """What the board reported in a log of the bus, in candump's format and with its times.
 
     Frames that the protocol refuses are left out, as the host does; a last line that is not whole
-    likewise.
+    likewise. Whose log it is, the host's handshake says.
 
     Raises:
-        ValueError: No line that is one, or wheels that were never all heard.
+        ValueError: The host was there for another robot, or not all wheels were heard.
     """
-    port, sensors = Port("HOST"), Sensors(robot)
+    host, board, sensors = Port("HOST"), Port("BOARD"), Sensors(robot)
+    words = fingerprint_words(robot.fingerprint)
     times, points, marks = list[float](), list[np.ndarray](), list[Marks]()
     axial_s, axial, n_axial = list[float](), list[float](), len(robot.axial_map)
     begin, due = 0.0, 0.0
     for now, frame in _frames(Path(path)):
-        received = port.unpack(frame)
+        asked = board.unpack(frame)
+        if isinstance(asked, Received) and asked.name == "CMD" and asked.values["Op"] == Op.ROBOT:
+            place, word = asked.values["Idx"], asked.values["Arg"]
+            if not 1 <= place <= len(words) or words[place - 1] != word:
+                raise ConfigError(
+                    f"{path}: the host ran a program of another robot; this is "
+                    f"{robot.config.name!r} ({robot.fingerprint})"
+                )
+        received = host.unpack(frame)
         if not isinstance(received, Received):
             continue
         sensors.update(now, *received)

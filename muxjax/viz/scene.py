@@ -92,7 +92,8 @@ def tendon_points(
     """Where each tendon passes the guides, from the base to the last disc of its segment [m].
 
     In segment n tendon j of segment i runs at the azimuth psi[n, i, j] on the circle of radius
-    r_a; the sum of the straight pieces is M Eq. 6, with xi chords a segment.
+    r_a. Of a tendon that keeps its azimuth the straight pieces add up to M Eq. 6, which has xi
+    chords a segment; that of another one has its step between two segments in no chord.
 
     Args:
         robot: The arm.

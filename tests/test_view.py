@@ -310,6 +310,9 @@ def test_a_journal_plays_the_run_without_being_touched(arm, program, recorded):
     end = track.at(track.duration_s)
     np.testing.assert_allclose(end.displacements, run.measured, atol=5e-5)
     assert end.phase == "completed"
+    # Its times are M Eq. 14's, but for trims and for the drum at the start.
+    predicted = timeline(arm, program).time_s[-1]
+    assert track.duration_s == pytest.approx(predicted, abs=2 * float(arm.switch_time))
     np.testing.assert_allclose(track.target, program.target)
     moving = [m for m in track.marks if m.phase.endswith(("move", "moves"))]
     assert len(moving) >= len(program.instructions)
@@ -401,10 +404,12 @@ def test_all_solutions_are_found_and_the_chosen_one_is_planned_to(arm):
     desk = Desk(arm)
     pose = muxjax.forward_kinematics(arm, Q)
     assert desk.solve(pose) == "2 configurations reach the target"
+    desk.axial = 5
     for k, q in enumerate(desk.solutions):
         np.testing.assert_allclose(muxjax.forward_kinematics(arm, q), pose, atol=1e-8)
         desk.chosen = k
         track = desk.plan("reverse")
+        assert track.at(0.0).slot == 5  # from where the drum stands
         end = muxjax.forward_kinematics(
             arm, muxjax.configuration_from_tendons(arm, track.at(1e9).displacements)
         )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import math
+import zipfile
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -126,6 +127,64 @@ def save_trajectory(samples: Samples, path: str | Path) -> None:
                     configuration_rad=samples.q,
                     tool_pose_m=samples.tool,
                 )
+
+
+def load_trajectory(robot: Robot, path: str | Path) -> Trajectory:
+    """Read the tendons of a file that ``save_trajectory`` or other software wrote.
+
+    A .csv file needs the columns time_s and tendon_1_m ...; its other columns are not read. An
+    .npz file also names its robot.
+
+    Raises:
+        ConfigError: No such file, another schema or robot, a column or array that is missing, or
+            numbers that make no trajectory; the message names it.
+    """
+    path = Path(path)
+    try:
+        time_s, points = (_from_npz if path.suffix == ".npz" else _from_csv)(robot, path)
+    except OSError as error:
+        raise ConfigError(f"{path}: cannot be read ({error.strerror or error})") from error
+    except (KeyError, zipfile.BadZipFile, ValueError) as error:
+        if isinstance(error, ConfigError):
+            raise
+        raise ConfigError(f"{path}: not a trajectory of {robot.config.name} ({error})") from error
+    if points.shape != (len(time_s), robot.n_tendons) or not len(time_s):
+        raise ConfigError(
+            f"{path}: displacements must have shape (T, {robot.n_tendons}) with T at least 1, "
+            f"found {points.shape}"
+        )
+    if not (np.isfinite(time_s).all() and np.isfinite(points).all()):
+        raise ConfigError(f"{path}: times and displacements must be finite")
+    if np.any(np.diff(time_s) < 0):
+        raise ConfigError(f"{path}: time_s must not fall")
+    return Trajectory(time_s, points)
+
+
+def _from_npz(robot: Robot, path: Path) -> tuple[np.ndarray, np.ndarray]:
+    with np.load(path, allow_pickle=False) as stored:
+        if str(stored["schema"]) != SCHEMA:
+            raise ConfigError(f"{path}: schema is {str(stored['schema'])!r}, expected {SCHEMA!r}")
+        found = str(stored["fingerprint"])
+        if found != robot.fingerprint:
+            raise ConfigError(
+                f"{path}: of robot {str(stored['robot'])!r} ({found}), this is "
+                f"{robot.config.name!r} ({robot.fingerprint})"
+            )
+        return stored["time_s"], stored["displacements_m"]
+
+
+def _from_csv(robot: Robot, path: Path) -> tuple[np.ndarray, np.ndarray]:
+    with open(path, newline="", encoding="utf-8") as file:
+        rows = list(csv.DictReader(file))
+    names = [f"tendon_{c}_m" for c in range(1, robot.n_tendons + 1)]
+    missing = [name for name in ("time_s", *names) if not rows or name not in rows[0]]
+    if missing:
+        raise ConfigError(f"{path}: has no column {missing[0]}, or no line below the names")
+    try:
+        table = np.array([[float(row[name]) for name in ("time_s", *names)] for row in rows])
+    except TypeError:
+        raise ConfigError(f"{path}: a line is shorter than the names") from None
+    return table[:, 0], table[:, 1:]
 
 
 def _quaternions(poses: Float[np.ndarray, "T 4 4"]) -> Float[np.ndarray, "T 4"]:

@@ -32,6 +32,7 @@ SHAPED = [
     "statics",
     "urdf",
     "trajectory_file",
+    *(f"viz.{part}" for part in ("scene", "drum", "obstacles", "playback", "recorded", "desk")),
 ]
 install_import_hook([f"muxjax.{room}" for room in SHAPED], "beartype.beartype")
 

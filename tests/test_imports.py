@@ -13,7 +13,10 @@ import pytest
 import muxjax
 
 # Heavy or optional: only the rooms that need them may import them, and only when used.
-OPTIONAL = ["torch", "gymnasium", "stable_baselines3", "can", "cantools", "matplotlib", "mcap"]
+OPTIONAL = [
+    *("torch", "gymnasium", "stable_baselines3", "can", "cantools"),
+    *("matplotlib", "mcap", "viser", "selenium"),
+]
 
 # ARCHITECTURE.md: nothing points back. A room imports rooms of earlier rows, and of its own row
 # only itself (planning and hardware have rooms inside).

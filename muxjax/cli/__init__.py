@@ -35,6 +35,7 @@ from muxjax.cli.statics import statics
 from muxjax.cli.sweep import sweep
 from muxjax.cli.task import task
 from muxjax.cli.urdf import urdf
+from muxjax.cli.view import view
 from muxjax.ik import IkError
 from muxjax.planning import PlanningError
 
@@ -57,6 +58,7 @@ COMMANDS: dict[str, Callable[..., Any]] = {
     "statics": statics,
     "task": task,
     "urdf": urdf,
+    "view": view,
 }
 
 

@@ -226,16 +226,11 @@ class Journal(MemoryJournal):
             _lock(file, path)
             with os.fdopen(os.dup(file), "rb") as reader:
                 data = reader.read()
-            whole = data.rfind(b"\n") + 1
-            lines = data[:whole].splitlines()
-            entries = [_parse(path, n, line) for n, line in enumerate(lines, start=1)]
-            if entries and not isinstance(entries[0], ProgramEntry):
-                raise ValueError(f"{path}, line 1: a journal begins with a program")
+            entries, whole = _entries(path, data)
             note = ""
             if whole < len(data):
-                note = (
-                    f"{path}, line {len(lines) + 1}: torn after {len(data) - whole} bytes; dropped"
-                )
+                torn = len(data) - whole
+                note = f"{path}, line {len(entries) + 1}: torn after {torn} bytes; dropped"
                 os.ftruncate(file, whole)
             os.fsync(file)
             _sync_folder(path.parent)
@@ -275,6 +270,29 @@ class Journal(MemoryJournal):
         trace: TracebackType | None,
     ) -> None:
         self.close()
+
+
+def read_entries(path: str | Path) -> list[Entry]:
+    """What a journal says, to look at: the file is neither locked nor mended.
+
+    A last line that is not yet whole is left out.
+
+    Raises:
+        ValueError: A line that is damaged or says something unknown, with its number.
+        OSError: The file cannot be read.
+    """
+    path = Path(path)
+    return _entries(path, path.read_bytes())[0]
+
+
+def _entries(path: Path, data: bytes) -> tuple[list[Entry], int]:
+    """Entries of the whole lines, and how many bytes those are."""
+    whole = data.rfind(b"\n") + 1
+    lines = data[:whole].splitlines()
+    entries = [_parse(path, n, line) for n, line in enumerate(lines, start=1)]
+    if entries and not isinstance(entries[0], ProgramEntry):
+        raise ValueError(f"{path}, line 1: a journal begins with a program")
+    return entries, whole
 
 
 def _parse(path: Path, number: int, line: bytes) -> Entry:

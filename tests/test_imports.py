@@ -31,7 +31,8 @@ ORDER = [
     {"workspace", "planning"},
     {"ik", "scheduler"},
     {"metrics", "hardware", "program_file", "plan_file", "trajectory_file"},
-    {"pipeline", "recording", "viz", "schemas"},
+    {"recording"},
+    {"pipeline", "viz", "schemas"},
     {"cli"},
     {"__init__", "__main__"},
 ]

@@ -13,6 +13,7 @@ from scipy.spatial.transform import Rotation
 
 import muxjax
 from muxjax.cli import main
+from muxjax.config import ConfigError
 from muxjax.hardware import LockstepLink
 from muxjax.hardware.log import LoggedLink
 from muxjax.hardware.protocol import BoardState, Fault, Frame, Port
@@ -234,7 +235,19 @@ def test_candumps_own_files_have_no_direction(robot, logged, tmp_path):
     plain.write_text(text)
     ours, theirs = read_log(robot, path), read_log(robot, plain)
     np.testing.assert_array_equal(ours.displacements, theirs.displacements)
-    assert theirs.refused == sum(line.endswith("T") for line in path.read_text().splitlines())
+    assert theirs.refused == 0
+
+
+def test_a_line_that_a_kill_cut_short_is_left_out(robot, logged, tmp_path):
+    _, path = logged
+    torn = tmp_path / "torn.log"
+    torn.write_text(path.read_text() + "(9999.0) can0 05")
+    assert read_log(robot, torn).time_s[-1] == read_log(robot, path).time_s[-1]
+
+
+def test_a_log_of_another_robot_is_refused(logged):
+    with pytest.raises(ConfigError, match="a program of another robot; this is 'penta'"):
+        read_log(muxjax.load_robot("penta"), logged[1])
 
 
 def test_times_of_a_bus_are_kept(robot, logged, tmp_path):

@@ -352,7 +352,7 @@ def test_files_that_cannot_be_played_say_why(arm, program, recorded, tmp_path):
         (arm, "none.json", "no such file"),
         (penta, "program.json", "made for robot 'muxarm'"),
         (arm, "empty.journal", "is empty"),
-        (arm, "no.log", "were not all heard"),
+        (arm, "no.log", "at no moment has every wheel"),
         (arm, "bad.json", "not readable as JSON"),
         (arm, "bad.csv", "no column tendon_2_m"),
         (arm, "bad.npz", "not a trajectory"),

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -21,24 +20,13 @@ from muxjax.hardware.journal import (
     SessionEntry,
     read_entries,
 )
-from muxjax.hardware.protocol import (
-    OFFLINE,
-    STALLED,
-    Frame,
-    Op,
-    Port,
-    Received,
-    fingerprint_words,
-)
-from muxjax.hardware.sensors import Sensors
 from muxjax.plan_file import load_plan
 from muxjax.program_file import load_program
+from muxjax.recording import LoggedRun, read_log
 from muxjax.robot import Robot
 from muxjax.scheduler import Program, Trajectory, check_same_robot, schedule
 from muxjax.trajectory_file import load_trajectory
 from muxjax.viz.playback import Marks, Track, lost_servos, move_words, track_of_program
-
-_LOG_EVERY_S = 0.04  # a bus log is sampled this often
 
 
 def read_track(robot: Robot, path: str | Path) -> Track:
@@ -61,7 +49,7 @@ def read_track(robot: Robot, path: str | Path) -> Track:
     if not first:
         raise ConfigError(f"{path}: is empty")
     if first.startswith(b"("):
-        return track_of_log(robot, path)
+        return track_of_run(robot, read_log(robot, path), path.name)
     if not first.startswith((b"{", b"[")):
         return track_of_journal(robot, read_entries(path), path.name)
     try:
@@ -170,88 +158,26 @@ def track_of_journal(robot: Robot, entries: list[Entry], name: str) -> Track:
     )
 
 
-def track_of_log(robot: Robot, path: str | Path) -> Track:
-    """What the board reported in a log of the bus, in candump's format and with its times.
-
-    Frames that the protocol refuses are left out, as the host does; a last line that is not whole
-    likewise. Whose log it is, the host's handshake says.
-
-    Raises:
-        ValueError: The host was there for another robot, or not all wheels were heard.
-    """
-    host, board, sensors = Port("HOST"), Port("BOARD"), Sensors(robot)
-    words = fingerprint_words(robot.fingerprint)
-    times, points, marks = list[float](), list[np.ndarray](), list[Marks]()
-    axial_s, axial, n_axial = list[float](), list[float](), len(robot.axial_map)
-    begin, due = 0.0, 0.0
-    for now, frame in _frames(Path(path)):
-        asked = board.unpack(frame)
-        if isinstance(asked, Received) and asked.name == "CMD" and asked.values["Op"] == Op.ROBOT:
-            place, word = asked.values["Idx"], asked.values["Arg"]
-            if not 1 <= place <= len(words) or words[place - 1] != word:
-                raise ConfigError(
-                    f"{path}: the host ran a program of another robot; this is "
-                    f"{robot.config.name!r} ({robot.fingerprint})"
-                )
-        received = host.unpack(frame)
-        if not isinstance(received, Received):
-            continue
-        sensors.update(now, *received)
-        if not sensors.complete:
-            continue
-        if not times:
-            begin = due = now
-        if received.name == "AXIAL_FB":
-            axial_s.append(now - begin)
-            axial.append(received.values["Position"] * n_axial / 360.0)
-        _mark(robot, sensors, now - begin, marks)
-        if now >= due:
-            times.append(now - begin)
-            points.append(sensors.displacements())
-            due = now + _LOG_EVERY_S
-    if not times:
-        raise ConfigError(
-            f"{path}: no log of this arm's board: its {robot.n_tendons} wheels and "
-            f"{robot.tendons_per_segment} servos were not all heard"
-        )
+def track_of_run(robot: Robot, run: LoggedRun, name: str) -> Track:
+    """What the board has reported, with the log's times."""
+    marks = list[Marks]()
+    line = run.trajectory
+    for k, time_s in enumerate(line.time_s):
+        engaged, phase = run.engaged[k], f"board {run.state[k].name.lower()}"
+        if engaged.any():
+            phase += ", clutches " + ", ".join(str(c + 1) for c in np.flatnonzero(engaged))
+        elif not run.axial[k]:
+            phase += ", drum turns"
+        last = marks[-1] if marks else None
+        if last is None or last.phase != phase or np.any(last.lost != run.servo_lost[k]):
+            marks.append(Marks(float(time_s), engaged, run.servo_lost[k], phase))
+    heard = np.isfinite(run.drum)
     return Track(
-        Path(path).name,
+        name,
         "recorded on the bus, wheels as measured",
-        Trajectory(np.array(times), np.array(points)),
+        line,
         tuple(marks),
-        np.array(axial_s),
-        np.array(axial),
+        line.time_s[heard],
+        run.drum[heard],
         float(robot.tendon_speed),
     )
-
-
-def _frames(path: Path) -> Iterator[tuple[float, Frame]]:
-    """Time [s] and frame of each line of a candump log."""
-    with open(path, encoding="ascii", errors="replace") as file:
-        for line in file:
-            words = line.split()
-            try:
-                name, _, data = words[2].partition("#")
-                yield float(words[0].strip("()")), Frame(int(name, 16), bytes.fromhex(data))
-            except (IndexError, ValueError):
-                continue
-
-
-def _mark(robot: Robot, sensors: Sensors, now: float, marks: list[Marks]) -> None:
-    """One mark more, if the drive is not as the last one says."""
-    layer, _, verified = sensors.clutches
-    engaged = np.zeros(robot.n_tendons, bool)
-    j = robot.tendons_per_segment
-    for within in range(j):
-        if verified >> within & 1 and layer:
-            engaged[(layer - 1) * j + within] = True
-    lost = np.array([bool(bits & (STALLED | OFFLINE)) for bits in sensors.servo_status])
-    state = sensors.state
-    phase = "" if state is None else f"board {state.name.lower()}"
-    if engaged.any():
-        phase += ", clutches " + ", ".join(str(c + 1) for c in np.flatnonzero(engaged))
-    elif not sensors.slot:
-        phase += ", drum turns"
-    last = marks[-1] if marks else None
-    if last is None or last.phase != phase or np.any(last.lost != lost):
-        marks.append(Marks(now if marks else 0.0, engaged, lost, phase))

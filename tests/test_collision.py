@@ -199,6 +199,7 @@ def test_many_obstacles_equal_one_at_a_time(muxarm, rng):
     np.testing.assert_allclose(measured(clearance, muxarm, q, world_of(*balls)), alone, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_large_batches_are_cut_into_equal_answers(muxarm, rng):
     q = random_configurations(muxarm, rng, 2051)
     world = load_world("cabinet")

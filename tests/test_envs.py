@@ -222,6 +222,7 @@ def test_starts_bent_and_axial_positions_are_drawn():
     assert not np.allclose(states.displacements[bent], np.array(states.target)[bent])
 
 
+@pytest.mark.slow
 def test_out_of_time_is_truncated_and_costs_the_penalty():
     env = Tdma(config(time_limit=2, unsolved_penalty=7.0, servo_sets=[(1,)]))
     state = env.reset(jax.random.key(0))
@@ -371,6 +372,7 @@ def test_continuous_actions_keep_to_limits(muxarm):
     np.testing.assert_array_equal(still.displacements, state.displacements)
 
 
+@pytest.mark.slow
 def test_observations_keep_to_their_parts():
     env = Tdma(config(lookahead=True, axial="random", bent=0.5))
     states = states_underway(env)

@@ -118,6 +118,7 @@ def test_a_window_shows_the_arm(monkeypatch):
     assert "muxjax/TDMA" not in plt.get_figlabels()
 
 
+@pytest.mark.slow
 def test_pickled_environments_go_on_alike():
     single, vector = TdmaEnv(ONE_SERVO), TdmaVectorEnv(3, ONE_SERVO)
     stable = TdmaVecEnv(ONE_SERVO, 3, seed=1)
@@ -176,6 +177,7 @@ def test_lanes_agree_with_single_episodes(muxarm, rng):
     np.testing.assert_allclose(total, singles, rtol=1e-4)
 
 
+@pytest.mark.slow
 def test_stable_baselines_environment_reports_ends(rng):
     env = TdmaVecEnv(ONE_SERVO, 8, seed=0)
     env.reset()

@@ -59,6 +59,7 @@ def test_fewer_candidates_say_that_not_all_were_considered(muxarm, rng):
         plan_to_pose(muxarm, pose, candidates=0)
 
 
+@pytest.mark.slow
 def test_an_arm_without_every_solution_takes_the_nearest(rng):
     penta = muxjax.load_robot("penta")
     pose = random_poses(penta, rng, 1)[0]

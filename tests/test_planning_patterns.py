@@ -56,6 +56,7 @@ def test_the_pattern_is_admissible_at_every_state(muxarm, rng, monkeypatch, acti
             assert (found <= table.value[:, stop] + 1e-12).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("servos", [(2,), (1, 2, 3, 4)])
 def test_it_is_admissible_where_the_arm_has_more_layers_than_it_knows(rng, servos):
     penta = muxjax.load_robot("penta")

@@ -71,6 +71,7 @@ def everything(robot, t):
     return angles + excess + t.wait + 5 * t.duration + (t.after**2 + t.before).sum(-1) ** 2
 
 
+@pytest.mark.slow
 def test_the_compiled_table_shows_terms_the_same_transitions(muxarm, rng):
     start, target = 0.5 * random_targets(muxarm, rng, 2)
     problem = Problem(start, target, weights={"all": 1.0}, terms={"all": everything}, servos=(2, 3))

@@ -59,6 +59,7 @@ def blocked(muxarm):
     raise AssertionError("every point of the path is next to its ends")
 
 
+@pytest.mark.slow
 def test_a_plan_goes_around(muxarm, blocked):
     problem, free = blocked
     assert least_clearance(muxarm, free, problem.world) < -SWEEP_TOLERANCE

@@ -108,6 +108,7 @@ def test_errors_are_what_they_are_called(rng):
     assert found.relative_orientation == pytest.approx([0.2])
 
 
+@pytest.mark.slow
 def test_the_unperturbed_truth_is_predicted_and_a_perturbed_one_less_well(small):
     """Of the same resolution and without perturbation, statics has no error; PCC still has."""
     options = {"postures": 9, "seed": 3, "finer": 1, "largest_tension": 5.0}

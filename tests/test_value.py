@@ -73,6 +73,7 @@ def test_features_are_finite_and_bounded(muxarm, rng):
             assert (count >= 0).all()
 
 
+@pytest.mark.slow
 def test_obstacles_and_unknown_terms_are_felt(muxarm, rng):
     lattice = random_lattice(muxarm, rng, weights={"travel": 1.0})
     world = muxjax.load_world("cabinet")

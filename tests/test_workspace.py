@@ -601,6 +601,7 @@ def test_pictures(muxarm: Robot, tmp_path: Path) -> None:
         assert path.stat().st_size > 10_000
 
 
+@pytest.mark.slow
 def test_a_sweep_in_a_world_counts_what_is_clear(muxarm: Robot, tmp_path: Path) -> None:
     """Against clearances of the same samples in float64; resumed, saved and drawn."""
     pytest.importorskip("matplotlib")

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import threading
 import time
+from collections import deque
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -64,7 +65,7 @@ class Viewer:
         self.desk, self.time_s, self.playing = desk, 0.0, False
         self.server = start_server(host, port, f"muxjax: {desk.robot.config.name}")
         self._lock, self._quiet = threading.RLock(), False
-        self._wanted: Float[np.ndarray, "4 4"] | None = None
+        self._wanted: deque[Float[np.ndarray, "4 4"]] = deque(maxlen=1)
         self._most = _TENSION_STEP
         self._ghosts: list[Any] = []
         scene, robot = self.server.scene, desk.robot
@@ -203,7 +204,7 @@ class Viewer:
         pose = np.eye(4)
         pose[:3, :3] = Rotation.from_quat(wxyz, scalar_first=True).as_matrix()
         pose[:3, 3] = position
-        self._wanted = pose
+        self._wanted.append(pose)
 
     def solve(self, pose: Float[np.ndarray, "4 4"]) -> str:
         """All solutions of a target, drawn; a refusal is shown, and returned."""
@@ -236,15 +237,18 @@ class Viewer:
                 )
 
     def choose(self, k: int) -> None:
-        """Choose a solution, from 0, for the next plan."""
+        """Choose a solution, from 0, for the next plan; nothing if there is no such one any more."""
         with self._lock:
+            if k >= len(self.desk.solutions):
+                return  # clicked in a browser that still showed those of the last target
             self.desk.chosen = k
             self.say(f"The next plan goes to solution {self.desk.label(k)}.")
             self._show_solutions()
 
     def _pick(self) -> None:
-        if len(self.desk.solutions):
-            self.choose(self.panel.solution.options.index(self.panel.solution.value))
+        options = self.panel.solution.options
+        if self.panel.solution.value in options:
+            self.choose(options.index(self.panel.solution.value))
 
     def _type_target(self) -> None:
         pose = np.eye(4)
@@ -295,15 +299,19 @@ class Viewer:
             ValueError: See ``Desk.plan``.
         """
         p = self.panel
-        methods = [p.method.value] + [m for m in (p.beside.value,) if m != NOTHING]
+        methods = list(dict.fromkeys(m for m in (p.method.value, p.beside.value) if m != NOTHING))
         self.say(f"Planning by {' and '.join(methods)} ...")
         found, said = [], []
-        for method in methods:
-            found.append(self.desk.plan(method))
-            said.append(self.desk.last)
-        self.refresh_tracks()
+        p.plan.disabled = True  # pressed again meanwhile, it would plan once more afterwards
+        try:
+            for method in methods:
+                found.append(self.desk.plan(method))
+                said.append(self.desk.last)
+        finally:
+            p.plan.disabled = False
+            self.refresh_tracks()  # if the second fails, the first is still on the timeline
         self.show_tracks([track.name for track in found])
-        self.say("; ".join(said) + ". Press Play.")
+        self.say("; ".join(said) + (". Press Play." if self.duration_s else ": it is there."))
 
     # Time
 
@@ -380,9 +388,8 @@ class Viewer:
 
     def tick(self, elapsed_s: float) -> None:
         """Let real time pass [s]: play on, and solve for the target last dragged to."""
-        wanted, self._wanted = self._wanted, None
-        if wanted is not None:
-            self.solve(wanted)
+        if self._wanted:
+            self.solve(self._wanted.pop())
         with self._lock:
             if not self.playing:
                 return

@@ -157,8 +157,8 @@ class Desk:
         least bent first.
 
         Raises:
-            ValueError: None reaches it, and the message says how far off the closest is; or all that
-                do are in collision. There are then no solutions.
+            ValueError: None reaches it, and the message says how far off the closest is; or all
+                that do are in collision. There are then no solutions.
         """
         self.target, self.chosen = np.asarray(pose, float), 0
         self.solutions = np.zeros((0, 2 * self.robot.n_segments))

@@ -26,7 +26,14 @@ from muxjax.recording import LoggedRun, read_log
 from muxjax.robot import Robot
 from muxjax.scheduler import Program, Trajectory, check_same_robot, schedule
 from muxjax.trajectory_file import load_trajectory
-from muxjax.viz.playback import Marks, Track, lost_servos, move_words, track_of_program
+from muxjax.viz.playback import (
+    Marks,
+    Track,
+    axial_before,
+    lost_servos,
+    move_words,
+    track_of_program,
+)
 
 
 def read_track(robot: Robot, path: str | Path) -> Track:
@@ -95,7 +102,8 @@ def track_of_journal(robot: Robot, entries: list[Entry], name: str) -> Track:
     if not entries:
         raise ConfigError(f"{name}: the journal holds no program")
     n = robot.n_tendons
-    none, lost = np.zeros(n, bool), np.zeros(robot.tendons_per_segment, bool)
+    none, failed = np.zeros(n, bool), np.zeros(robot.tendons_per_segment, bool)
+    lost = failed
     now, engaged = np.zeros(n), none
     time_s, axial = 0.0, 0.0
     times, points, marks = list[float](), list[np.ndarray](), list[Marks]()
@@ -106,14 +114,13 @@ def track_of_journal(robot: Robot, entries: list[Entry], name: str) -> Track:
         if isinstance(entry, ProgramEntry):
             check_same_robot(robot, entry.program)
             program = entry.program
-            lost = lost | lost_servos(robot, program.servos)
+            lost = failed | lost_servos(robot, program.servos)
             if not points:
-                now = np.array(program.start)
-                axial = float(program.axial - 1) if program.axial else 0.0
+                now, axial = np.array(program.start), axial_before(program)
             phase = f"a program of {len(program.instructions)} stages begins"
         elif isinstance(entry, ServoEntry):
-            lost = lost.copy()
-            lost[entry.servo - 1] = True
+            one = np.arange(len(failed)) == entry.servo - 1
+            failed, lost = failed | one, lost | one
             phase = f"servo {entry.servo} failed: {entry.reason}"
         else:
             reached = np.array(
@@ -125,12 +132,14 @@ def track_of_journal(robot: Robot, entries: list[Entry], name: str) -> Track:
             stage = f"stage {entry.visit} of {len(program.instructions)}"
             if entry.leg == 1 or not engaged.any():
                 slot = program.instructions[entry.visit - 1].axial - 1
+                turns = slot != axial
                 axial_s.append(time_s)
                 positions.append(axial)
                 times.append(time_s)
                 points.append(now)
-                marks.append(Marks(time_s, none, lost, f"{stage}: drum turns to {slot + 1}"))
-                time_s += float(robot.switch_time)
+                what = f"drum turns to {slot + 1}" if turns else "clutches engage"
+                marks.append(Marks(time_s, none, lost, f"{stage}: {what}"))
+                time_s += float(robot.switch_time if turns else robot.engage_time)
                 axial = float(slot)
                 axial_s.append(time_s - float(robot.engage_time))
                 positions.append(axial)

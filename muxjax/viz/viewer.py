@@ -237,7 +237,7 @@ class Viewer:
                 )
 
     def choose(self, k: int) -> None:
-        """Choose a solution, from 0, for the next plan; nothing if there is no such one any more."""
+        """Choose a solution, from 0, for the next plan; one that is gone is not chosen."""
         with self._lock:
             if k >= len(self.desk.solutions):
                 return  # clicked in a browser that still showed those of the last target

@@ -204,11 +204,15 @@ def test_surfaces_lie_where_the_collision_model_has_them(arm, name, kinds):
         np.testing.assert_allclose(np.linalg.norm(ring - line[0], axis=1), bore)
 
 
-def test_clouds_lie_within_reach(arm, tmp_path):
+def test_a_sampled_cloud_lies_within_reach(arm):
     points = sampled_cloud(arm, 500)
     assert points.dtype == np.float32
     assert np.linalg.norm(points, axis=1).max() <= np.sum(arm.length) * (1 + 1e-5)
     assert points[:, 1].min() >= 0  # the half behind the arm
+
+
+@pytest.mark.slow
+def test_a_sweeps_cloud_lies_within_reach(arm):
     sweep = muxjax.sweep(arm, samples=1 << 17, cells=(8, 16))
     cells, dexterity = sweep_cloud(arm, sweep)
     assert np.all((dexterity >= 0) & (dexterity <= 1))
@@ -392,7 +396,7 @@ def test_files_that_cannot_be_played_say_why(arm, program, recorded, tmp_path):
         (penta, "program.json", "made for robot 'muxarm'"),
         (arm, "empty.journal", "is empty"),
         (arm, "no.log", "at no moment has every wheel"),
-        (arm, "bad.json", "not readable as JSON"),
+        (arm, "bad.json", "Invalid JSON"),
         (arm, "bad.csv", "no column tendon_2_m"),
         (arm, "bad.npz", "not a trajectory"),
         (arm, "damaged.journal", "line 1: checksum"),

@@ -19,6 +19,7 @@ from muxjax.planning.motion import angles_at
 from muxjax.robot import Robot
 from muxjax.scheduler import Program, Trajectory
 from muxjax.tendons import configuration_from_tendons
+from muxjax.viz.scene import guide_frames, tendon_points
 from muxjax.viz.style import MARKERS, STYLE, save_figure
 
 # Okabe-Ito colours by segment, distinguishable without colour vision; in grey print the markers
@@ -180,15 +181,20 @@ def draw_arm(
         moving: Tendons, from 0, that are drawn thick.
         alpha: Opacity.
     """
-    q = configuration_from_tendons(robot, displacements)
-    frames = backbone(robot, q, _POINTS_A_SEGMENT)
-    points = 1e3 * frames[:, :3, 3]
+    q = np.asarray(configuration_from_tendons(robot, displacements))
+    points = 1e3 * backbone(robot, q, _POINTS_A_SEGMENT)[:, :3, 3]
     for segment in range(robot.n_segments):
         part = slice(segment * _POINTS_A_SEGMENT, (segment + 1) * _POINTS_A_SEGMENT + 1)
         axes.plot(*points[part].T, color=colour(segment), lw=3, alpha=alpha)
-        _draw_discs(axes, robot, q, segment, alpha)
-    for c in range(robot.n_tendons):
-        _draw_tendon(axes, robot, frames, c, thick=c in moving, alpha=alpha)
+    frames = guide_frames(robot, q)
+    _draw_discs(axes, robot, frames[1:], alpha)
+    for c, path in enumerate(tendon_points(robot, frames)):
+        segment, j = divmod(c, robot.tendons_per_segment)
+        thick = c in moving
+        axes.plot(
+            *(1e3 * path.T), style(j), color=colour(segment), lw=2.4 if thick else 0.7,
+            alpha=alpha * (1.0 if thick else 0.7),
+        )  # fmt: skip
 
 
 def arm_picture(
@@ -216,35 +222,13 @@ def arm_picture(
     return np.array(canvas.buffer_rgba())[..., :3]
 
 
-def _draw_discs(axes: Any, robot: Robot, q: Any, segment: int, alpha: float) -> None:
-    n = int(robot.n_discs[segment])
-    discs = backbone(robot, q, n)[segment * n + 1 : (segment + 1) * n + 1]
+def _draw_discs(axes: Any, robot: Robot, discs: Float[np.ndarray, "D 4 4"], alpha: float) -> None:
     turn = np.linspace(0, 2 * np.pi, 33)
     rim = float(robot.body_radius) * np.stack([np.cos(turn), np.sin(turn), 0 * turn])
     for disc in discs:
         axes.plot(
             *(1e3 * (disc[:3, :3] @ rim + disc[:3, 3:])), color="0.4", lw=0.5, alpha=0.6 * alpha
         )
-
-
-def _draw_tendon(
-    axes: Any, robot: Robot, frames: Any, tendon: int, *, thick: bool, alpha: float
-) -> None:
-    segment, j = divmod(tendon, robot.tendons_per_segment)
-    end = (segment + 1) * _POINTS_A_SEGMENT + 1
-    crossed = np.minimum(np.arange(end) // _POINTS_A_SEGMENT, segment)
-    azimuth = robot.tendon_azimuth[crossed, segment, j]
-    holes = float(robot.tendon_radius) * np.stack(
-        [np.cos(azimuth), np.sin(azimuth), 0 * azimuth], axis=-1
-    )
-    path = frames[:end, :3, 3] + np.einsum("pij,pj->pi", frames[:end, :3, :3], holes)
-    axes.plot(
-        *(1e3 * path.T),
-        style(j),
-        color=colour(segment),
-        lw=2.4 if thick else 0.7,
-        alpha=alpha * (1.0 if thick else 0.7),
-    )
 
 
 def _frame_arm(axes: Any, robot: Robot) -> None:

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -20,11 +18,9 @@ from muxjax.hardware.journal import (
     SessionEntry,
     read_entries,
 )
-from muxjax.plan_file import load_plan
-from muxjax.program_file import load_program
-from muxjax.recording import LoggedRun, read_log
+from muxjax.recording import LoggedRun, read_log, read_program
 from muxjax.robot import Robot
-from muxjax.scheduler import Program, Trajectory, check_same_robot, schedule
+from muxjax.scheduler import Program, Trajectory, check_same_robot
 from muxjax.trajectory_file import load_trajectory
 from muxjax.viz.playback import (
     Marks,
@@ -59,19 +55,7 @@ def read_track(robot: Robot, path: str | Path) -> Track:
         return track_of_run(robot, read_log(robot, path), path.name)
     if not first.startswith((b"{", b"[")):
         return track_of_journal(robot, read_entries(path), path.name)
-    try:
-        document: Any = json.loads(path.read_bytes())
-    except ValueError as error:
-        raise ConfigError(f"{path}: not readable as JSON ({error})") from error
-    schema = str(document.get("schema")) if isinstance(document, dict) else ""
-    try:
-        if schema.startswith("muxjax/plan/"):
-            return track_of_program(robot, schedule(robot, load_plan(path)), path.name)
-        return track_of_program(robot, load_program(path), path.name)
-    except ConfigError:
-        raise
-    except ValueError as error:
-        raise ConfigError(f"{path}: {error}") from error
+    return track_of_program(robot, read_program(robot, path), path.name)
 
 
 def _track_of_trajectory(robot: Robot, line: Trajectory, name: str) -> Track:

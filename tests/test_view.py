@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import socket
+import threading
 import time
 from dataclasses import replace
 from itertools import pairwise
@@ -532,6 +533,34 @@ def test_what_cannot_be_is_refused_and_the_slider_goes_back(viewer):
     assert viewer.desk.q[0] == pytest.approx(np.radians(10.0))
     panel.play.value = True
     assert "nothing to play" in panel.status.content
+
+
+def test_a_slider_that_is_further_on_already_is_not_put_back(viewer, monkeypatch):
+    slider, bend = viewer.panel.angles[0], viewer.desk.set_q_deg
+
+    def slowly(q_deg):
+        bend(q_deg)
+        slider._impl.value = 31.0  # the browser has moved it on; that will act in its turn
+
+    monkeypatch.setattr(viewer.desk, "set_q_deg", slowly)
+    slider.value = 30.0
+    assert slider.value == 31.0
+    assert viewer.panel.tendons[0].value < 0  # the others follow
+
+
+def test_a_frame_does_not_take_back_where_a_person_has_put_the_time(arm, program, viewer):
+    viewer.desk.tracks["mine"] = track_of_program(arm, program, "mine")
+    viewer.show_tracks(["mine"])
+    viewer.panel.play.value = True
+    person = threading.Thread(target=setattr, args=(viewer.panel.time, "value", 5.0))
+    with viewer._lock:  # as while a frame is drawn
+        person.start()
+        _until(lambda: viewer.panel.time.value == 5.0, "the slider was not moved")
+        time.sleep(0.05)
+        viewer.tick(0.1)
+    person.join()
+    assert viewer.time_s == viewer.panel.time.value == 5.0
+    assert not viewer.playing
 
 
 def test_dragging_solves_for_the_last_place_only(arm, viewer):

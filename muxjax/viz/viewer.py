@@ -66,6 +66,7 @@ class Viewer:
         self.server = start_server(host, port, f"muxjax: {desk.robot.config.name}")
         self._lock, self._quiet = threading.RLock(), False
         self._wanted: deque[Float[np.ndarray, "4 4"]] = deque(maxlen=1)
+        self._acting: Any = None  # the control that a person has changed and that acts now
         self._most = _TENSION_STEP
         self._ghosts: list[Any] = []
         scene, robot = self.server.scene, desk.robot
@@ -141,14 +142,22 @@ class Viewer:
         """Have a control act, unless it was the viewer itself that changed it."""
 
         def react(_: Any) -> None:
+            set_to = control.value
             with self._lock:
                 if self._quiet:
                     return
+                if control is self.panel.time and self.playing:
+                    with self._silently():
+                        control.value = set_to  # a frame has moved it on while this waited
+                self._acting = control
                 try:
                     act()
                 except ValueError as error:
+                    self._acting = None
                     self.warn(str(error))
                     self._sync()
+                finally:
+                    self._acting = None
 
         (control.on_click if hasattr(control, "on_click") else control.on_update)(react)
 
@@ -420,19 +429,24 @@ class Viewer:
     def _silently(self) -> _Silence:
         return _Silence(self)
 
+    def _put(self, control: Any, value: Any) -> None:
+        """Set a control; one that acts now is where a person has it, maybe further on already."""
+        if control is not self._acting:
+            control.value = value
+
     def _sync(self) -> None:
         """Bring every control and the scene up to date."""
         p, desk = self.panel, self.desk
         with self._silently(), self.server.atomic():
             for slider, angle in zip(p.angles, np.degrees(desk.q), strict=True):
-                slider.value = float(np.clip(round(angle, 1), slider.min, slider.max))
+                self._put(slider, float(np.clip(round(angle, 1), slider.min, slider.max)))
             for slider, length in zip(p.tendons, 1e3 * desk.displacements, strict=True):
-                slider.value = float(np.clip(round(length, 1), slider.min, slider.max)) + 0.0
-            p.axial.value = desk.axial
+                self._put(slider, float(np.clip(round(length, 1), slider.min, slider.max)) + 0.0)
+            self._put(p.axial, desk.axial)
             p.time.max = max(round(self.duration_s, 2), 0.01)
             p.play.label = "Pause" if self.playing else "Play"
             for box, lost in zip(p.failed, desk.failed, strict=True):
-                box.value = bool(lost)
+                self._put(box, bool(lost))
         self._redraw()
 
     def _redraw(self) -> None:
@@ -449,7 +463,7 @@ class Viewer:
                 q = desk.shape(other.displacements)
                 self.right.draw(other, q, self._looks(other))
                 self.right.title.text, self.right.title.visible = right.name, True
-            p.time.value = min(round(self.time_s, 2), p.time.max)
+            self._put(p.time, min(round(self.time_s, 2), p.time.max))
             p.legend.content = legend_html(p.colour.value, self._most)
             p.readout.content = readout(
                 desk, moment, self.shown_tracks, self.time_s, p.colour.value

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import csv
+import importlib
 import io
 import json
+import pkgutil
 import re
 from pathlib import Path
 from typing import get_args
@@ -408,6 +410,12 @@ def test_a_folder_that_is_no_training_is_refused(tmp_path, text):
 
 
 # -- files and the command ------------------------------------------------------------------------
+
+
+def test_no_module_of_figures_is_hidden_by_a_function():
+    for module in pkgutil.iter_modules(muxjax.viz.__path__):
+        found = importlib.import_module(f"muxjax.viz.{module.name}")
+        assert getattr(muxjax.viz, module.name) is found
 
 
 def test_the_unit_check_can_fail(robot, programs):

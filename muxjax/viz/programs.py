@@ -20,12 +20,8 @@ from muxjax.robot import Robot
 from muxjax.scheduler import Program, Trajectory
 from muxjax.tendons import configuration_from_tendons
 from muxjax.viz.scene import guide_frames, tendon_points
-from muxjax.viz.style import MARKERS, STYLE, save_figure
+from muxjax.viz.style import MARKERS, SEGMENT_COLOURS, STYLE, TENDON_STYLES, save_figure
 
-# Okabe-Ito colours by segment, distinguishable without colour vision; in grey print the markers
-# tell segments apart, and the line styles their tendons.
-SEGMENT_COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
-TENDON_STYLES = ("-", "--", ":", "-.")
 _POINTS_A_SEGMENT = 24
 _PANELS_A_ROW = 4
 _FRAMES_A_SECOND = 10
@@ -41,7 +37,7 @@ def marker(segment: int) -> str:
     return MARKERS[segment % len(MARKERS)]
 
 
-def style(tendon: int) -> str:
+def tendon_style(tendon: int) -> str:
     """Line style of a tendon within its segment, counting from 0."""
     return TENDON_STYLES[tendon % len(TENDON_STYLES)]
 
@@ -127,7 +123,7 @@ def _draw_lengths(axes: Any, robot: Robot, line: Trajectory) -> None:
         segment, tendon = divmod(c, robot.tendons_per_segment)
         at = [0, *np.flatnonzero(np.diff(values)) + 1, len(values) - 1]  # where it has moved
         axes.plot(
-            line.time_s, 1e3 * values, style(tendon), marker=marker(segment), markevery=at,
+            line.time_s, 1e3 * values, tendon_style(tendon), marker=marker(segment), markevery=at,
             ms=2.5, color=colour(segment), lw=1.0,
         )  # fmt: skip
 
@@ -156,7 +152,8 @@ def _legend(robot: Robot) -> tuple[list[Any], list[str]]:
         for i in range(robot.n_segments)
     ]
     tendons = [
-        mpl.lines.Line2D([], [], color="0.3", ls=style(j)) for j in range(robot.tendons_per_segment)
+        mpl.lines.Line2D([], [], color="0.3", ls=tendon_style(j))
+        for j in range(robot.tendons_per_segment)
     ]
     motion = mpl.patches.Patch(color="0.5", alpha=0.15, lw=0)
     names = [f"segment {i + 1}" for i in range(robot.n_segments)]
@@ -192,7 +189,7 @@ def draw_arm(
         segment, j = divmod(c, robot.tendons_per_segment)
         thick = c in moving
         axes.plot(
-            *(1e3 * path.T), style(j), color=colour(segment), lw=2.4 if thick else 0.7,
+            *(1e3 * path.T), tendon_style(j), color=colour(segment), lw=2.4 if thick else 0.7,
             alpha=alpha * (1.0 if thick else 0.7),
         )  # fmt: skip
 

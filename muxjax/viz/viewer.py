@@ -16,6 +16,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
+from muxjax.kinematics import roll_pitch_yaw
 from muxjax.viz.desk import Desk
 from muxjax.viz.panel import BY_HAND, NOTHING, build_panel, legend_html, readout
 from muxjax.viz.playback import Moment, Track
@@ -234,7 +235,7 @@ class Viewer:
             p.solution.options = names
             p.solution.value = names[desk.chosen]
             p.position.value = tuple(float(x) for x in np.round(1e3 * desk.target[:3, 3], 2))
-            angles = Rotation.from_matrix(desk.target[:3, :3]).as_euler("xyz", degrees=True)
+            angles = np.degrees(roll_pitch_yaw(desk.target[:3, :3]))
             p.turn.value = tuple(float(x) for x in np.round(angles, 2) + 0.0)
         with self.server.atomic():
             for drawn in self._ghosts:

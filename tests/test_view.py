@@ -622,6 +622,19 @@ def test_where_the_arm_is_there_is_nothing_to_play(viewer):
     assert "Press Play" not in viewer.panel.status.content
 
 
+def test_a_mistake_in_a_control_is_said_and_the_others_go_on(viewer, monkeypatch):
+    def broken(method):
+        raise RuntimeError("out of memory")
+
+    monkeypatch.setattr(viewer.desk, "plan", broken)
+    with pytest.raises(RuntimeError):
+        viewer.panel.plan.value = True
+    assert "out of memory" in viewer.panel.status.content
+    assert not viewer.panel.plan.disabled
+    viewer.panel.angles[0].value = 30.0
+    assert viewer.desk.q[0] == pytest.approx(np.radians(30.0))
+
+
 def test_a_plan_stays_if_the_one_beside_it_fails(arm, viewer, monkeypatch):
     viewer.solve(muxjax.forward_kinematics(arm, Q))
     plan = viewer.desk.plan

@@ -153,10 +153,13 @@ class Viewer:
                 self._acting = control
                 try:
                     act()
-                except ValueError as error:
+                except Exception as error:
                     self._acting = None
-                    self.warn(str(error))
+                    refused = isinstance(error, ValueError)
+                    self.warn(str(error) if refused else f"{error!r}: the terminal says where.")
                     self._sync()
+                    if not refused:
+                        raise  # a mistake of ours; viser prints it and goes on
                 finally:
                     self._acting = None
 

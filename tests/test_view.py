@@ -792,7 +792,9 @@ def test_in_chromium_sliders_boxes_plan_and_play_act(arm, viewer):
         assert first.std() > 10  # not blank
         thumb = browser.find_elements("css selector", "[role=slider]")[0]
         thumb.send_keys(*[Keys.ARROW_RIGHT] * 5)
-        _until(lambda: viewer.desk.q[0] > 0, "the slider did not bend the arm")
+        # All five steps of 0.1 degrees: a later one would take back what is set below.
+        wanted = pytest.approx(np.radians(0.5))
+        _until(lambda: viewer.desk.q[0] == wanted, "the slider did not bend the arm")
         assert viewer.desk.displacements[0] < 0
         viewer.panel.angles[0].value = 60.0
         second = pixels(settle(browser))

@@ -276,3 +276,16 @@ def check_configuration(robot: Robot, q: object) -> Float[np.ndarray, "*batch do
             f"{np.degrees(robot.theta_max[segment]):.4g}"
         )
     return checked
+
+
+def roll_pitch_yaw(rotation: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "3"]:
+    """Angles [rad] about the fixed axes x, y, z, one after the other, for a person to read.
+
+    Where the pitch is 90 degrees roll and yaw turn about one axis: the yaw is then 0.
+    """
+    r = np.asarray(rotation, dtype=np.float64)
+    level = float(np.hypot(r[0, 0], r[1, 0]))
+    pitch = np.arctan2(-r[2, 0], level)
+    if level < 1e-7:
+        return np.array([np.arctan2(-r[1, 2], r[1, 1]), pitch, 0.0])
+    return np.array([np.arctan2(r[2, 1], r[2, 2]), pitch, np.arctan2(r[1, 0], r[0, 0])])

@@ -144,14 +144,14 @@ def load_trajectory(robot: Robot, path: str | Path) -> Trajectory:
         time_s, points = (_from_npz if path.suffix == ".npz" else _from_csv)(robot, path)
     except OSError as error:
         raise ConfigError(f"{path}: cannot be read ({error.strerror or error})") from error
-    except (KeyError, zipfile.BadZipFile, ValueError) as error:
+    except (KeyError, TypeError, EOFError, zipfile.BadZipFile, csv.Error, ValueError) as error:
         if isinstance(error, ConfigError):
             raise
         raise ConfigError(f"{path}: not a trajectory of {robot.config.name} ({error})") from error
-    if points.shape != (len(time_s), robot.n_tendons) or not len(time_s):
+    if time_s.ndim != 1 or points.shape != (time_s.size, robot.n_tendons) or not time_s.size:
         raise ConfigError(
-            f"{path}: displacements must have shape (T, {robot.n_tendons}) with T at least 1, "
-            f"found {points.shape}"
+            f"{path}: displacements must have shape (T, {robot.n_tendons}) and times (T,) with T "
+            f"at least 1, found {points.shape} and {time_s.shape}"
         )
     if not (np.isfinite(time_s).all() and np.isfinite(points).all()):
         raise ConfigError(f"{path}: times and displacements must be finite")
@@ -170,7 +170,7 @@ def _from_npz(robot: Robot, path: Path) -> tuple[np.ndarray, np.ndarray]:
                 f"{path}: of robot {str(stored['robot'])!r} ({found}), this is "
                 f"{robot.config.name!r} ({robot.fingerprint})"
             )
-        return stored["time_s"], stored["displacements_m"]
+        return stored["time_s"].astype(float), stored["displacements_m"].astype(float)
 
 
 def _from_csv(robot: Robot, path: Path) -> tuple[np.ndarray, np.ndarray]:

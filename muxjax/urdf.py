@@ -17,10 +17,9 @@ import xml.etree.ElementTree as ET
 from pathlib import Path
 
 import numpy as np
-import scipy
 from jaxtyping import Float
 
-from muxjax.kinematics import check_configuration
+from muxjax.kinematics import check_configuration, roll_pitch_yaw
 from muxjax.robot import Robot
 
 COLOURS = ((0.12, 0.35, 0.60), (0.85, 0.55, 0.15), (0.30, 0.55, 0.35))  # of segments, in turn
@@ -176,9 +175,7 @@ def _joint(
     root: ET.Element, name: str, kind: str, parent: str, child: str, at: Float[np.ndarray, "4 4"]
 ) -> ET.Element:
     joint = ET.SubElement(root, "joint", name=name, type=kind)
-    rpy = scipy.spatial.transform.Rotation.from_matrix(at[:3, :3]).as_euler(
-        "xyz"
-    )  # fixed axes, as URDF has them
+    rpy = roll_pitch_yaw(at[:3, :3])  # fixed axes, as URDF has them
     texts = (" ".join(repr(float(v) + 0.0) for v in row) for row in (at[:3, 3], rpy))
     ET.SubElement(joint, "origin", xyz=next(texts), rpy=next(texts))
     ET.SubElement(joint, "parent", link=parent)

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import csv
+import importlib
 import io
 import json
+import pkgutil
 import re
 from pathlib import Path
 from typing import get_args
@@ -17,7 +19,15 @@ import muxjax
 from muxjax.cli import main
 from muxjax.cli.figure import Case as CaseName
 from muxjax.config import load_yaml, resolve
-from muxjax.hardware.accuracy import CASES, Case, Trial, nearest, pose_errors, run_trial
+from muxjax.hardware.accuracy import (
+    CASES,
+    Case,
+    Trial,
+    nearest,
+    pose_errors,
+    random_targets,
+    run_trial,
+)
 from muxjax.metrics.case_study import PANELS, Panel
 from muxjax.metrics.program import evaluate, timeline
 from muxjax.metrics.protocol import Protocol
@@ -172,6 +182,14 @@ def test_slip_of_half_a_millimetre_moves_the_tool_by_millimetres(robot, programs
     assert np.all(np.diff(trial.time_s) >= 0)
 
 
+def test_targets_are_within_the_robots_limits():
+    penta = muxjax.load_robot("penta")  # whose last segment bends less than the others
+    theta = muxjax.configuration_from_tendons(penta, random_targets(penta, 200))[:, 0::2]
+    assert np.all(theta <= penta.theta_max + 1e-9)
+    assert np.all(theta.min(axis=0) < 0.3)
+    assert np.all(theta.max(axis=0) > 1.5)
+
+
 def test_pose_errors_are_a_metric():
     rng = np.random.default_rng(2)
     turns = rng.uniform(0.1, 3.0, 8)
@@ -218,6 +236,7 @@ def test_sample_points_are_means_over_their_runs(trial):
     np.testing.assert_allclose(point.tool, trial.planned[-1, -1, :3, 3])
 
 
+@pytest.mark.slow
 def test_sample_points_stand_on_the_map_where_their_tool_is(robot, trial):
     found = sweep(robot, samples=20_000)
     point = sample_point("S", [trial])
@@ -393,6 +412,12 @@ def test_a_folder_that_is_no_training_is_refused(tmp_path, text):
 # -- files and the command ------------------------------------------------------------------------
 
 
+def test_no_module_of_figures_is_hidden_by_a_function():
+    for module in pkgutil.iter_modules(muxjax.viz.__path__):
+        found = importlib.import_module(f"muxjax.viz.{module.name}")
+        assert getattr(muxjax.viz, module.name) is found
+
+
 def test_the_unit_check_can_fail(robot, programs):
     figure = programs_figure(robot, programs, "title")
     figure.axes[1].set_ylabel("displacement")
@@ -473,7 +498,7 @@ def test_a_wrong_request_is_refused_before_any_work(figure_command, tmp_path, mo
         assert re.search(message, error), error
 
 
-def test_the_gallerys_numbers_are_those_of_its_commands(figure_command, tmp_path):
+def test_the_gallery_is_small_pictures_named_by_their_commands(figure_command, tmp_path):
     out = tmp_path / "images"
     code, text, _ = figure_command(
         "gallery", "--only", "table1", "table3", "--out", str(out), "--json"

@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from conftest import random_configurations
+from scipy.spatial.transform import Rotation
 
 import muxjax
 from muxjax.kinematics import (
@@ -21,6 +22,7 @@ from muxjax.kinematics import (
     check_configuration,
     configuration_from_bending,
     pose_from_bending,
+    roll_pitch_yaw,
     stumpff,
 )
 from muxjax.robot import Robot
@@ -270,3 +272,19 @@ def test_a_bending_beyond_the_limit_is_refused_by_name(muxarm):
     q[1, 4] = np.radians(-141)
     with pytest.raises(ValueError, match=r"segment 3 is 141 degrees"):
         check_configuration(muxarm, q)
+
+
+@pytest.mark.filterwarnings("error")
+def test_roll_pitch_and_yaw_compose_to_the_rotation(rng):
+    turns = [*Rotation.random(50, rng=rng), Rotation.identity()]
+    turns += [
+        Rotation.from_euler("xyz", [r, p, 0.7]) for r in (0, -2) for p in (-np.pi / 2, np.pi / 2)
+    ]
+    for turn in turns:
+        rpy = roll_pitch_yaw(turn.as_matrix())
+        assert abs(rpy[1]) <= np.pi / 2
+        again = Rotation.from_euler("xyz", rpy)
+        np.testing.assert_allclose(again.as_matrix(), turn.as_matrix(), atol=1e-7)
+    np.testing.assert_allclose(
+        roll_pitch_yaw(Rotation.from_euler("xyz", [0.1, 0.2, 0.3]).as_matrix()), [0.1, 0.2, 0.3]
+    )

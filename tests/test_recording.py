@@ -16,7 +16,7 @@ from muxjax.cli import main
 from muxjax.config import ConfigError
 from muxjax.hardware import LockstepLink
 from muxjax.hardware.log import LoggedLink
-from muxjax.hardware.protocol import BoardState, Fault, Frame, Port
+from muxjax.hardware.protocol import BoardState, Fault, Port
 from muxjax.metrics.program import timeline
 from muxjax.program_file import save_program
 from muxjax.recording import (
@@ -30,6 +30,7 @@ from muxjax.recording.mcap import SCHEMA, SCHEMAS
 from muxjax.scheduler import Program
 from muxjax.trajectory_file import sample
 from muxjax.urdf import urdf_joint_angles, urdf_joints
+from muxjax.viz.recorded import track_of_run
 
 Q = np.array([0.5, 1.0, 0.7, 2.0, 0.4, 3.0])
 
@@ -305,6 +306,17 @@ def test_nothing_is_believed_while_turns_are_lost(robot, tmp_path):
     assert read_log(robot, path).time_s.max() < 3.0
 
 
+def test_a_little_below_the_first_position_is_the_first_position(robot, tmp_path):
+    port, path = Port("BOARD"), tmp_path / "drum.log"
+    drum = port.pack("AXIAL_FB", InPosition=1, Moving=0, Position=359.99, Slot=1, Current=0)
+    path.write_text(
+        f"(0.5) can0 {drum.id:03X}#{drum.data.hex()} R\n" + lines_of(port, 1.0, 2, False)
+    )
+    run = read_log(robot, path)
+    np.testing.assert_allclose(run.drum, -0.01 * 9 / 360, atol=1e-9)
+    assert run.axial[0] == track_of_run(robot, run, "run").at(0.0).slot == 1
+
+
 @pytest.mark.parametrize(
     ("text", "message"),
     [
@@ -379,7 +391,6 @@ def test_a_frame_is_eight_bytes(robot, tmp_path):
     port, path = Port("BOARD"), tmp_path / "short.log"
     path.write_text("(0.5) can0 058#0011 R\n" + lines_of(port, 1.0, 2, False))
     assert read_log(robot, path).refused == 1
-    assert Frame(0x58, b"\x00\x11").id == 0x58
 
 
 def test_the_npz_of_a_run_is_its_trajectory_at_the_same_times(robot, logged, both):

@@ -13,7 +13,7 @@ from muxjax.cli import main
 from muxjax.metrics.program import timeline
 from muxjax.program_file import save_program
 from muxjax.scheduler import Program, Trajectory
-from muxjax.trajectory_file import columns, sample, save_trajectory
+from muxjax.trajectory_file import columns, load_trajectory, sample, save_trajectory
 
 Q = np.array([0.5, 1.0, 0.7, 2.0, 0.4, 3.0])
 
@@ -116,6 +116,31 @@ def test_another_ending_is_refused(muxarm, program, tmp_path):
     with pytest.raises(muxjax.ConfigError, match=r"t\.txt: .* ends in \.csv or \.npz"):
         save_trajectory(samples, tmp_path / "t.txt")
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_file_that_holds_no_trajectory_is_refused(muxarm, tmp_path):
+    def npz(time_s, points) -> None:
+        about = {"schema": "muxjax/trajectory/1", "robot": "", "fingerprint": muxarm.fingerprint}
+        np.savez(tmp_path / "t.npz", **about, time_s=time_s, displacements_m=points)
+
+    header = ",".join(["time_s", *(f"tendon_{c}_m" for c in range(1, 10))]) + "\n"
+    for name, write in (
+        ("t.npz", lambda: npz(0.0, np.zeros((1, 9)))),
+        ("t.npz", lambda: npz(np.zeros((1, 1)), np.zeros((1, 9)))),
+        ("t.npz", lambda: npz(np.zeros(2), np.zeros((2, 8)))),
+        ("t.npz", lambda: npz(np.zeros(0), np.zeros((0, 9)))),
+        ("t.npz", lambda: npz(np.array(["now"]), np.zeros((1, 9)))),
+        ("t.npz", lambda: npz(np.array([1.0, 0.0]), np.zeros((2, 9)))),
+        ("t.npz", lambda: (tmp_path / "t.npz").write_bytes(b"")),
+        ("t.npz", lambda: np.save((tmp_path / "t.npz").open("wb"), np.zeros(3))),
+        ("t.csv", lambda: (tmp_path / "t.csv").write_text(header + "0," + "1" * 200_000)),
+        ("t.csv", lambda: (tmp_path / "t.csv").write_text(header + "0,1\n")),
+        ("t.csv", lambda: (tmp_path / "t.csv").write_text(header + "0" + ",inf" * 9)),
+        ("t.csv", lambda: (tmp_path / "t.csv").write_text(header)),
+    ):
+        write()
+        with pytest.raises(muxjax.ConfigError, match=rf"t\{name[1:]}: "):
+            load_trajectory(muxarm, tmp_path / name)
 
 
 def test_the_command_writes_the_file(capsys, monkeypatch, tmp_path, program, muxarm):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json as json_text
 from pathlib import Path
 from typing import Annotated
 
@@ -10,12 +9,18 @@ import tyro
 
 from muxjax.cli.output import console, notice, print_json
 from muxjax.metrics.program import timeline
-from muxjax.plan_file import load_plan
-from muxjax.program_file import load_program, save_program
-from muxjax.recording import Recording, logged_recording, program_recording, read_log, save_mcap
+from muxjax.program_file import save_program
+from muxjax.recording import (
+    Recording,
+    logged_recording,
+    program_recording,
+    read_log,
+    read_program,
+    save_mcap,
+)
 from muxjax.recording.mcap import SCHEMAS
 from muxjax.robot import Robot, load_robot
-from muxjax.scheduler import Program, schedule
+from muxjax.scheduler import Program
 from muxjax.trajectory_file import Samples, columns, sample, save_trajectory
 
 
@@ -61,7 +66,7 @@ def export(
             raise ValueError(f"--out: a run is no program; {out} must end in .csv, .npz or .mcap")
         document, text = _write_run(arm, source, out, rate_hz, per_segment)
     else:
-        document, text = _write_program(arm, _program(arm, source), out, rate_hz, per_segment)
+        document, text = _write_program(arm, read_program(arm, source), out, rate_hz, per_segment)
     if json:
         print_json({"robot": arm.config.name, "file": str(out), **document})
     else:
@@ -109,15 +114,3 @@ def _write_mcap(
     end = float(recording.samples.time_s[-1])
     document = {"messages": count, "duration_s": end, "topics": list(SCHEMAS)}
     return document, f"{count} messages of {len(SCHEMAS)} topics, {end:.2f} s, written to {out}"
-
-
-def _program(arm: Robot, source: Path) -> Program:
-    """Program of a program's or a plan's file, told apart by their schema lines."""
-    try:
-        found = json_text.loads(source.read_bytes())
-        line = found.get("schema", "") if isinstance(found, dict) else ""
-    except (OSError, ValueError):
-        line = ""  # load_program says what is wrong
-    if str(line).startswith("muxjax/plan/"):
-        return schedule(arm, load_plan(source))
-    return load_program(source)

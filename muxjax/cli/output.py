@@ -14,7 +14,7 @@ from rich.console import Console
 from rich.text import Text
 from rich.theme import Theme
 
-from muxjax.kinematics import check_configuration
+from muxjax.kinematics import check_configuration, roll_pitch_yaw
 from muxjax.robot import Robot
 
 # rich leaves colours out where the output is no terminal, and where NO_COLOR is set.
@@ -110,6 +110,6 @@ def pose_document(pose: Any) -> dict[str, Any]:
     return {
         "position_m": pose[:3, 3],
         "quaternion_wxyz": turn.as_quat(scalar_first=True, canonical=True),
-        "rpy_deg": turn.as_euler("xyz", degrees=True),
+        "rpy_deg": np.degrees(roll_pitch_yaw(pose[:3, :3])),
         "matrix": pose,
     }

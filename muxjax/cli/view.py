@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import numpy as np
 import tyro
 
-from muxjax.cli.output import console, notice
+from muxjax.cli.output import configuration_argument, console, notice
 from muxjax.cli.plans import Method
 from muxjax.cli.poses import Quaternion, Xyz, pose_argument
 from muxjax.collision import load_world
@@ -146,7 +146,7 @@ def _desk(
         track = read_track(arm, path)
         desk.tracks[_unused(track.name, desk.tracks)] = track
     if q_deg is not None:
-        desk.set_q_deg(np.asarray(q_deg))
+        desk.set_q_deg(np.degrees(configuration_argument(arm, "--q-deg", q_deg)))
     every = tuple(range(1, arm.tendons_per_segment + 1))
     for servo in servos or every:
         if servo not in every:

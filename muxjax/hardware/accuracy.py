@@ -124,10 +124,14 @@ class Trial:
 
 
 def random_targets(robot: Robot, count: int, seed: int = SEED) -> Float[np.ndarray, "N SJ"]:
-    """Tendon displacements [m] of targets that bend each segment by 0.2 to 1.6 rad."""
+    """Tendon displacements [m] of targets that bend each segment by 0.2 to 1.6 rad.
+
+    Less, if its limit is less.
+    """
     rng = np.random.default_rng(seed)
+    low, high = np.minimum(0.2, robot.theta_max), np.minimum(1.6, robot.theta_max)
     q = np.stack(
-        [rng.uniform(0.2, 1.6, (count, robot.n_segments)),
+        [rng.uniform(low, high, (count, robot.n_segments)),
          rng.uniform(0.0, 2 * np.pi, (count, robot.n_segments))], axis=-1,
     ).reshape(count, -1)  # fmt: skip
     return np.asarray(tendon_displacements(robot, q))

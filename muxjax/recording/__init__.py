@@ -1,6 +1,7 @@
-"""What an arm and its drive did over time: of a program, or of a run's frames; MCAP files of it."""
+"""What an arm and its drive do over time: of files of programs, plans and runs; MCAP files."""
 
 from muxjax.recording.mcap import save_mcap
+from muxjax.recording.programs import read_program
 from muxjax.recording.recording import Recording, program_recording, take
 from muxjax.recording.run_log import LoggedRun, logged_recording, read_log
 
@@ -10,6 +11,7 @@ __all__ = [
     "logged_recording",
     "program_recording",
     "read_log",
+    "read_program",
     "save_mcap",
     "take",
 ]

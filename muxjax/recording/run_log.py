@@ -42,7 +42,8 @@ class LoggedRun:
         servo_rad: Shaft angles of the servos [rad].
         servo_lost: Servos that have stalled or do not answer.
         axial: Axial position, from 1; 0 between two.
-        drum: Where the drum stands, from 0, with fractions; NaN before it has reported.
+        drum: Where the drum stands, from 0, with fractions, at least -0.5; NaN before it has
+            reported.
         engaged: Tendons whose clutches are energised.
         state: Of the board.
         refused: Frames of the board that were damaged, and were left out.
@@ -104,7 +105,9 @@ def read_log(robot: Robot, path: str | Path) -> LoggedRun:
                 sensors.forget_turns()
             boots = sensors.boot_count
         if read.name == "AXIAL_FB":
-            drum = read.values["Position"] * len(robot.axial_map) / 360.0
+            slots = len(robot.axial_map)
+            # An encoder's last digit below the first position's zero reads as almost 360 degrees.
+            drum = (read.values["Position"] * slots / 360.0 + 0.5) % slots - 0.5
         whole = (read.name, read.values.get("Group")) == last_group
         if whole and sensors.complete:
             times.append(at_s)

@@ -1,26 +1,21 @@
-"""Figures and animations with matplotlib. Millimetres and degrees, as for a person's eye.
+"""What a person looks at: figures and animations with matplotlib, and the viewer in the browser.
 
-``programs`` draws arms and what programs do over time, ``statics`` postures under load.
+Millimetres and degrees, as for a person's eye. ``programs`` draws arms and what programs do over
+time, ``statics`` postures under load; ``viewer`` needs viser, and is not loaded with the others.
 """
 
 from muxjax.viz.programs import (
-    SEGMENT_COLOURS,
     animate,
     arm_picture,
-    colour,
     compare_programs,
     draw_arm,
     programs_figure,
-    style,
 )
 
 __all__ = [
-    "SEGMENT_COLOURS",
     "animate",
     "arm_picture",
-    "colour",
     "compare_programs",
     "draw_arm",
     "programs_figure",
-    "style",
 ]

@@ -12,8 +12,7 @@ from jaxtyping import Float
 from matplotlib.figure import Figure
 
 from muxjax.hardware.accuracy import Trial, rmse
-from muxjax.viz.programs import SEGMENT_COLOURS
-from muxjax.viz.style import INK, MARKERS, STYLE
+from muxjax.viz.style import INK, MARKERS, SEGMENT_COLOURS, STYLE
 from muxjax.workspace import Sweep
 from muxjax.workspace.plots import draw_dexterity
 

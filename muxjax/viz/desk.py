@@ -1,6 +1,6 @@
 """What the viewer knows and can be asked to do, without any window: pose, solutions, plans, time.
 
-Every refusal is a ``ValueError`` whose message a person can act on, and leaves all as it was.
+Every refusal is a ``ValueError`` whose message a person can act on, and leaves the arm as it was.
 """
 
 from __future__ import annotations
@@ -94,11 +94,17 @@ class Desk:
     def set_q_deg(self, q_deg: Float[np.ndarray, " dof"]) -> None:
         """Bend the arm; tendons follow (M Eq. 6).
 
+        Args:
+            q_deg: Any angles; kept with theta at least 0 and phi from 0 to 360, as sliders have it.
+
         Raises:
             ValueError: A segment beyond its bending limit.
         """
         q = check_configuration(self.robot, np.radians(q_deg))
-        self.q, self.displacements = q, np.asarray(tendon_displacements(self.robot, q))
+        theta, phi = q[0::2], q[1::2] + np.where(q[0::2] < 0, np.pi, 0.0)
+        turned = np.where((phi < 0) | (phi > 2 * np.pi), phi % (2 * np.pi), phi)
+        self.q = np.stack([np.abs(theta), turned], axis=-1).ravel()
+        self.displacements = np.asarray(tendon_displacements(self.robot, self.q))
 
     def set_tendons_mm(self, lengths: Float[np.ndarray, " SJ"]) -> None:
         """Set tendons; the bending is what they define (M Eq. 4-5), as in the middle of a plan.
@@ -151,7 +157,8 @@ class Desk:
         least bent first.
 
         Raises:
-            ValueError: None reaches it; the message says how far off the closest is.
+            ValueError: None reaches it, and the message says how far off the closest is; or all
+                that do are in collision. There are then no solutions.
         """
         self.target, self.chosen = np.asarray(pose, float), 0
         self.solutions = np.zeros((0, 2 * self.robot.n_segments))
@@ -162,8 +169,7 @@ class Desk:
             nearest = solve_ik(
                 self.robot, self.target, q0=self.q, weights=weights, project_rotations=True
             )
-            self.solutions = np.asarray(nearest.check().q)[None]
-            return "one configuration reaches the target"
+            found = np.asarray(nearest.check().q)[None]
         text = f"{len(found)} configuration{'s reach' if len(found) > 1 else ' reaches'} the target"
         if not bool(every.complete):
             text += " (there may be more)"
@@ -180,7 +186,8 @@ class Desk:
     def aim_at_end_of(self, track: Track) -> bool:
         """Put the target where a track's tool goes; whether that is another one than before.
 
-        Its solutions are not looked for: the track has its own.
+        It is not if the tool ends at the target in what of it counts. Solutions of another one are
+        not looked for: the track has its own.
         """
         end = track.at(track.duration_s).displacements if track.target is None else track.target
         q = np.asarray(configuration_from_tendons(self.robot, end))
@@ -188,7 +195,9 @@ class Desk:
             return False
         pose = np.asarray(forward_kinematics(self.robot, q))
         # A plan ends at its target but for the planner's tolerance.
-        if np.allclose(pose, self.target, atol=1e-4):
+        counts = np.ones((3, 4), bool)
+        counts[:, :2], counts[:, 2] = GOALS[self.goal][5] > 0, GOALS[self.goal][3] > 0
+        if np.allclose(pose[:3][counts], self.target[:3][counts], atol=1e-4):
             return False
         self.target, self.chosen = pose, 0
         self.solutions = np.zeros((0, len(q)))

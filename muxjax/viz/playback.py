@@ -124,11 +124,7 @@ def track_of_program(robot: Robot, program: Program, name: str) -> Track:
     lost = lost_servos(robot, program.servos)
     none = np.zeros(robot.n_tendons, bool)
     marks = [Marks(0.0, none, lost, "at rest")]
-    axial_s, axial = [0.0], [float(program.axial - 1) if program.axial else 0.0]
-    if program.axial is None and program.instructions:
-        # Where the drum stands first is not known: it is drawn at a neighbour, as it has to turn.
-        first = program.instructions[0].axial
-        axial = [first - 2.0 if first > 1 else 1.0]
+    axial_s, axial = [0.0], [axial_before(program)]
     point, count = 1, len(program.instructions)
     for number, item in enumerate(program.instructions, start=1):
         # timeline: one point where the visit's motion begins, then one a leg.
@@ -157,6 +153,17 @@ def track_of_program(robot: Robot, program: Program, name: str) -> Track:
         float(robot.tendon_speed),
         np.array(program.target),
     )
+
+
+def axial_before(program: Program) -> float:
+    """Where the drum stands before a program, from 0.
+
+    If that is not known, beside where it goes first: it counts as turning there (M Eq. 14).
+    """
+    if program.axial is not None:
+        return program.axial - 1.0
+    first = program.instructions[0].axial if program.instructions else 2
+    return first - 2.0 if first > 1 else 1.0
 
 
 def move_words(tendons: Sequence[int]) -> str:

@@ -19,12 +19,9 @@ from muxjax.planning.motion import angles_at
 from muxjax.robot import Robot
 from muxjax.scheduler import Program, Trajectory
 from muxjax.tendons import configuration_from_tendons
-from muxjax.viz.style import MARKERS, STYLE, save_figure
+from muxjax.viz.scene import guide_frames, tendon_points
+from muxjax.viz.style import MARKERS, SEGMENT_COLOURS, STYLE, TENDON_STYLES, save_figure
 
-# Okabe-Ito colours by segment, distinguishable without colour vision; in grey print the markers
-# tell segments apart, and the line styles their tendons.
-SEGMENT_COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
-TENDON_STYLES = ("-", "--", ":", "-.")
 _POINTS_A_SEGMENT = 24
 _PANELS_A_ROW = 4
 _FRAMES_A_SECOND = 10
@@ -40,7 +37,7 @@ def marker(segment: int) -> str:
     return MARKERS[segment % len(MARKERS)]
 
 
-def style(tendon: int) -> str:
+def tendon_style(tendon: int) -> str:
     """Line style of a tendon within its segment, counting from 0."""
     return TENDON_STYLES[tendon % len(TENDON_STYLES)]
 
@@ -126,7 +123,7 @@ def _draw_lengths(axes: Any, robot: Robot, line: Trajectory) -> None:
         segment, tendon = divmod(c, robot.tendons_per_segment)
         at = [0, *np.flatnonzero(np.diff(values)) + 1, len(values) - 1]  # where it has moved
         axes.plot(
-            line.time_s, 1e3 * values, style(tendon), marker=marker(segment), markevery=at,
+            line.time_s, 1e3 * values, tendon_style(tendon), marker=marker(segment), markevery=at,
             ms=2.5, color=colour(segment), lw=1.0,
         )  # fmt: skip
 
@@ -155,7 +152,8 @@ def _legend(robot: Robot) -> tuple[list[Any], list[str]]:
         for i in range(robot.n_segments)
     ]
     tendons = [
-        mpl.lines.Line2D([], [], color="0.3", ls=style(j)) for j in range(robot.tendons_per_segment)
+        mpl.lines.Line2D([], [], color="0.3", ls=tendon_style(j))
+        for j in range(robot.tendons_per_segment)
     ]
     motion = mpl.patches.Patch(color="0.5", alpha=0.15, lw=0)
     names = [f"segment {i + 1}" for i in range(robot.n_segments)]
@@ -180,15 +178,20 @@ def draw_arm(
         moving: Tendons, from 0, that are drawn thick.
         alpha: Opacity.
     """
-    q = configuration_from_tendons(robot, displacements)
-    frames = backbone(robot, q, _POINTS_A_SEGMENT)
-    points = 1e3 * frames[:, :3, 3]
+    q = np.asarray(configuration_from_tendons(robot, displacements))
+    points = 1e3 * backbone(robot, q, _POINTS_A_SEGMENT)[:, :3, 3]
     for segment in range(robot.n_segments):
         part = slice(segment * _POINTS_A_SEGMENT, (segment + 1) * _POINTS_A_SEGMENT + 1)
         axes.plot(*points[part].T, color=colour(segment), lw=3, alpha=alpha)
-        _draw_discs(axes, robot, q, segment, alpha)
-    for c in range(robot.n_tendons):
-        _draw_tendon(axes, robot, frames, c, thick=c in moving, alpha=alpha)
+    frames = guide_frames(robot, q)
+    _draw_discs(axes, robot, frames[1:], alpha)
+    for c, path in enumerate(tendon_points(robot, frames)):
+        segment, j = divmod(c, robot.tendons_per_segment)
+        thick = c in moving
+        axes.plot(
+            *(1e3 * path.T), tendon_style(j), color=colour(segment), lw=2.4 if thick else 0.7,
+            alpha=alpha * (1.0 if thick else 0.7),
+        )  # fmt: skip
 
 
 def arm_picture(
@@ -216,35 +219,13 @@ def arm_picture(
     return np.array(canvas.buffer_rgba())[..., :3]
 
 
-def _draw_discs(axes: Any, robot: Robot, q: Any, segment: int, alpha: float) -> None:
-    n = int(robot.n_discs[segment])
-    discs = backbone(robot, q, n)[segment * n + 1 : (segment + 1) * n + 1]
+def _draw_discs(axes: Any, robot: Robot, discs: Float[np.ndarray, "D 4 4"], alpha: float) -> None:
     turn = np.linspace(0, 2 * np.pi, 33)
     rim = float(robot.body_radius) * np.stack([np.cos(turn), np.sin(turn), 0 * turn])
     for disc in discs:
         axes.plot(
             *(1e3 * (disc[:3, :3] @ rim + disc[:3, 3:])), color="0.4", lw=0.5, alpha=0.6 * alpha
         )
-
-
-def _draw_tendon(
-    axes: Any, robot: Robot, frames: Any, tendon: int, *, thick: bool, alpha: float
-) -> None:
-    segment, j = divmod(tendon, robot.tendons_per_segment)
-    end = (segment + 1) * _POINTS_A_SEGMENT + 1
-    crossed = np.minimum(np.arange(end) // _POINTS_A_SEGMENT, segment)
-    azimuth = robot.tendon_azimuth[crossed, segment, j]
-    holes = float(robot.tendon_radius) * np.stack(
-        [np.cos(azimuth), np.sin(azimuth), 0 * azimuth], axis=-1
-    )
-    path = frames[:end, :3, 3] + np.einsum("pij,pj->pi", frames[:end, :3, :3], holes)
-    axes.plot(
-        *(1e3 * path.T),
-        style(j),
-        color=colour(segment),
-        lw=2.4 if thick else 0.7,
-        alpha=alpha * (1.0 if thick else 0.7),
-    )
 
 
 def _frame_arm(axes: Any, robot: Robot) -> None:

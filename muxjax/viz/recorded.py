@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -20,13 +18,18 @@ from muxjax.hardware.journal import (
     SessionEntry,
     read_entries,
 )
-from muxjax.plan_file import load_plan
-from muxjax.program_file import load_program
-from muxjax.recording import LoggedRun, read_log
+from muxjax.recording import LoggedRun, read_log, read_program
 from muxjax.robot import Robot
-from muxjax.scheduler import Program, Trajectory, check_same_robot, schedule
+from muxjax.scheduler import Program, Trajectory, check_same_robot
 from muxjax.trajectory_file import load_trajectory
-from muxjax.viz.playback import Marks, Track, lost_servos, move_words, track_of_program
+from muxjax.viz.playback import (
+    Marks,
+    Track,
+    axial_before,
+    lost_servos,
+    move_words,
+    track_of_program,
+)
 
 
 def read_track(robot: Robot, path: str | Path) -> Track:
@@ -52,19 +55,7 @@ def read_track(robot: Robot, path: str | Path) -> Track:
         return track_of_run(robot, read_log(robot, path), path.name)
     if not first.startswith((b"{", b"[")):
         return track_of_journal(robot, read_entries(path), path.name)
-    try:
-        document: Any = json.loads(path.read_bytes())
-    except ValueError as error:
-        raise ConfigError(f"{path}: not readable as JSON ({error})") from error
-    schema = str(document.get("schema")) if isinstance(document, dict) else ""
-    try:
-        if schema.startswith("muxjax/plan/"):
-            return track_of_program(robot, schedule(robot, load_plan(path)), path.name)
-        return track_of_program(robot, load_program(path), path.name)
-    except ConfigError:
-        raise
-    except ValueError as error:
-        raise ConfigError(f"{path}: {error}") from error
+    return track_of_program(robot, read_program(robot, path), path.name)
 
 
 def _track_of_trajectory(robot: Robot, line: Trajectory, name: str) -> Track:
@@ -95,7 +86,8 @@ def track_of_journal(robot: Robot, entries: list[Entry], name: str) -> Track:
     if not entries:
         raise ConfigError(f"{name}: the journal holds no program")
     n = robot.n_tendons
-    none, lost = np.zeros(n, bool), np.zeros(robot.tendons_per_segment, bool)
+    none, failed = np.zeros(n, bool), np.zeros(robot.tendons_per_segment, bool)
+    lost = failed
     now, engaged = np.zeros(n), none
     time_s, axial = 0.0, 0.0
     times, points, marks = list[float](), list[np.ndarray](), list[Marks]()
@@ -106,14 +98,13 @@ def track_of_journal(robot: Robot, entries: list[Entry], name: str) -> Track:
         if isinstance(entry, ProgramEntry):
             check_same_robot(robot, entry.program)
             program = entry.program
-            lost = lost | lost_servos(robot, program.servos)
+            lost = failed | lost_servos(robot, program.servos)
             if not points:
-                now = np.array(program.start)
-                axial = float(program.axial - 1) if program.axial else 0.0
+                now, axial = np.array(program.start), axial_before(program)
             phase = f"a program of {len(program.instructions)} stages begins"
         elif isinstance(entry, ServoEntry):
-            lost = lost.copy()
-            lost[entry.servo - 1] = True
+            one = np.arange(len(failed)) == entry.servo - 1
+            failed, lost = failed | one, lost | one
             phase = f"servo {entry.servo} failed: {entry.reason}"
         else:
             reached = np.array(
@@ -125,12 +116,14 @@ def track_of_journal(robot: Robot, entries: list[Entry], name: str) -> Track:
             stage = f"stage {entry.visit} of {len(program.instructions)}"
             if entry.leg == 1 or not engaged.any():
                 slot = program.instructions[entry.visit - 1].axial - 1
+                turns = slot != axial
                 axial_s.append(time_s)
                 positions.append(axial)
                 times.append(time_s)
                 points.append(now)
-                marks.append(Marks(time_s, none, lost, f"{stage}: drum turns to {slot + 1}"))
-                time_s += float(robot.switch_time)
+                what = f"drum turns to {slot + 1}" if turns else "clutches engage"
+                marks.append(Marks(time_s, none, lost, f"{stage}: {what}"))
+                time_s += float(robot.switch_time if turns else robot.engage_time)
                 axial = float(slot)
                 axial_s.append(time_s - float(robot.engage_time))
                 positions.append(axial)

@@ -28,7 +28,7 @@ BY_STATE: dict[State, tuple[tuple[int, int, int], float, bool]] = {
 _SHADES = np.array(
     [[215, 195, 90], [165, 155, 110], [112, 114, 118], [60, 74, 108], [0, 34, 78]], dtype=float
 )
-# Okabe-Ito colours of segments as elsewhere, mixed with white, in the order of ``viz.programs``.
+# Okabe-Ito colours of segments as elsewhere, mixed with white, in the order of ``viz.style``.
 _SEGMENTS = (
     (102, 170, 209),
     (240, 190, 153),

@@ -53,7 +53,6 @@ class Stage:
         base = np.asarray(robot.base)
         self.root = scene.add_frame(name, show_axes=False, position=place)
         frames = guide_frames(robot, np.zeros(2 * robot.n_segments))
-        self._paths = tendon_points(robot, frames)
         self._add_arm(frames)
         self._add_drum()
         self.title = scene.add_label(
@@ -81,7 +80,7 @@ class Stage:
             scene.add_line_segments(
                 f"{name}/tendons/{c + 1}", strokes(path, dashed=False), _GREY, thickness=0.001
             )
-            for c, path in enumerate(self._paths)
+            for c, path in enumerate(tendon_points(robot, frames))
         ]
         self._axis = scene.add_line_segments(
             f"{name}/axis", strokes(frames[:, :3, 3], dashed=False), _BLACK, thickness=0.004
@@ -173,13 +172,13 @@ class Stage:
         """
         robot = self._robot
         frames = guide_frames(robot, q)
-        self._paths = tendon_points(robot, frames)
+        paths = tendon_points(robot, frames)
         self.discs.batched_positions = frames[:, :3, 3]
         self.discs.batched_wxyzs = quaternion(frames[:, :3, :3])
         self._axis.points = strokes(frames[:, :3, 3], dashed=False)
         tool = frames[-1] @ robot.tool
         self._tool.position, self._tool.wxyz = tool[:3, 3], quaternion(tool[:3, :3])
-        for handle, path, look in zip(self._tendons, self._paths, looks, strict=True):
+        for handle, path, look in zip(self._tendons, paths, looks, strict=True):
             handle.points = strokes(path, dashed=look.dashed)
             handle.colors = np.array(look.colour, np.uint8)
             handle.thickness = look.thickness

@@ -15,8 +15,7 @@ from muxjax.statics.chain import ElasticChain
 from muxjax.statics.curvature import pcc_bending, pcc_frames
 from muxjax.statics.experiment import Experiment
 from muxjax.statics.result import Equilibrium
-from muxjax.viz.programs import SEGMENT_COLOURS
-from muxjax.viz.style import GREY, INK, STYLE, save_figure
+from muxjax.viz.style import GREY, INK, SEGMENT_COLOURS, STYLE, save_figure
 
 _METHODS = {
     "FST": SEGMENT_COLOURS[1],

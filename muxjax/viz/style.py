@@ -14,6 +14,10 @@ from muxjax.config import replacing
 ENDINGS = (".pdf", ".svg", ".png")
 MARKERS = ("o", "s", "^", "D", "v", "P", "X", "*")
 INK, GREY = "#1f2933", "0.55"
+# Okabe-Ito colours by segment, distinguishable without colour vision; in grey print the markers
+# tell segments apart, and the line styles their tendons.
+SEGMENT_COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
+TENDON_STYLES = ("-", "--", ":", "-.")
 
 # Sizes of a printed column; text stays text in vector files, for editors and for search. The salt
 # and the missing date make the same figure the same file.

@@ -13,8 +13,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from muxjax.config import ConfigError
-from muxjax.viz.programs import SEGMENT_COLOURS, TENDON_STYLES
-from muxjax.viz.style import MARKERS, STYLE
+from muxjax.viz.style import MARKERS, SEGMENT_COLOURS, STYLE, TENDON_STYLES
 
 Curve = Sequence[Mapping[str, float]]  # a line an evaluation
 

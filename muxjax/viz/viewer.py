@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import threading
 import time
+from collections import deque
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -15,6 +16,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
+from muxjax.kinematics import roll_pitch_yaw
 from muxjax.viz.desk import Desk
 from muxjax.viz.panel import BY_HAND, NOTHING, build_panel, legend_html, readout
 from muxjax.viz.playback import Moment, Track
@@ -64,7 +66,8 @@ class Viewer:
         self.desk, self.time_s, self.playing = desk, 0.0, False
         self.server = start_server(host, port, f"muxjax: {desk.robot.config.name}")
         self._lock, self._quiet = threading.RLock(), False
-        self._wanted: Float[np.ndarray, "4 4"] | None = None
+        self._wanted: deque[Float[np.ndarray, "4 4"]] = deque(maxlen=1)
+        self._acting: Any = None  # the control that a person has changed and that acts now
         self._most = _TENSION_STEP
         self._ghosts: list[Any] = []
         scene, robot = self.server.scene, desk.robot
@@ -140,14 +143,25 @@ class Viewer:
         """Have a control act, unless it was the viewer itself that changed it."""
 
         def react(_: Any) -> None:
+            set_to = control.value
             with self._lock:
                 if self._quiet:
                     return
+                if control is self.panel.time and self.playing:
+                    with self._silently():
+                        control.value = set_to  # a frame has moved it on while this waited
+                self._acting = control
                 try:
                     act()
-                except ValueError as error:
-                    self.warn(str(error))
+                except Exception as error:
+                    self._acting = None
+                    refused = isinstance(error, ValueError)
+                    self.warn(str(error) if refused else f"{error!r}: the terminal says where.")
                     self._sync()
+                    if not refused:
+                        raise  # a mistake of ours; viser prints it and goes on
+                finally:
+                    self._acting = None
 
         (control.on_click if hasattr(control, "on_click") else control.on_update)(react)
 
@@ -203,7 +217,7 @@ class Viewer:
         pose = np.eye(4)
         pose[:3, :3] = Rotation.from_quat(wxyz, scalar_first=True).as_matrix()
         pose[:3, 3] = position
-        self._wanted = pose
+        self._wanted.append(pose)
 
     def solve(self, pose: Float[np.ndarray, "4 4"]) -> str:
         """All solutions of a target, drawn; a refusal is shown, and returned."""
@@ -224,7 +238,7 @@ class Viewer:
             p.solution.options = names
             p.solution.value = names[desk.chosen]
             p.position.value = tuple(float(x) for x in np.round(1e3 * desk.target[:3, 3], 2))
-            angles = Rotation.from_matrix(desk.target[:3, :3]).as_euler("xyz", degrees=True)
+            angles = np.degrees(roll_pitch_yaw(desk.target[:3, :3]))
             p.turn.value = tuple(float(x) for x in np.round(angles, 2) + 0.0)
         with self.server.atomic():
             for drawn in self._ghosts:
@@ -236,15 +250,18 @@ class Viewer:
                 )
 
     def choose(self, k: int) -> None:
-        """Choose a solution, from 0, for the next plan."""
+        """Choose a solution, from 0, for the next plan; one that is gone is not chosen."""
         with self._lock:
+            if k >= len(self.desk.solutions):
+                return  # clicked in a browser that still showed those of the last target
             self.desk.chosen = k
             self.say(f"The next plan goes to solution {self.desk.label(k)}.")
             self._show_solutions()
 
     def _pick(self) -> None:
-        if len(self.desk.solutions):
-            self.choose(self.panel.solution.options.index(self.panel.solution.value))
+        options = self.panel.solution.options
+        if self.panel.solution.value in options:
+            self.choose(options.index(self.panel.solution.value))
 
     def _type_target(self) -> None:
         pose = np.eye(4)
@@ -295,15 +312,19 @@ class Viewer:
             ValueError: See ``Desk.plan``.
         """
         p = self.panel
-        methods = [p.method.value] + [m for m in (p.beside.value,) if m != NOTHING]
+        methods = list(dict.fromkeys(m for m in (p.method.value, p.beside.value) if m != NOTHING))
         self.say(f"Planning by {' and '.join(methods)} ...")
         found, said = [], []
-        for method in methods:
-            found.append(self.desk.plan(method))
-            said.append(self.desk.last)
-        self.refresh_tracks()
+        p.plan.disabled = True  # pressed again meanwhile, it would plan once more afterwards
+        try:
+            for method in methods:
+                found.append(self.desk.plan(method))
+                said.append(self.desk.last)
+        finally:
+            p.plan.disabled = False
+            self.refresh_tracks()  # if the second fails, the first is still on the timeline
         self.show_tracks([track.name for track in found])
-        self.say("; ".join(said) + ". Press Play.")
+        self.say("; ".join(said) + (". Press Play." if self.duration_s else ": it is there."))
 
     # Time
 
@@ -380,9 +401,8 @@ class Viewer:
 
     def tick(self, elapsed_s: float) -> None:
         """Let real time pass [s]: play on, and solve for the target last dragged to."""
-        wanted, self._wanted = self._wanted, None
-        if wanted is not None:
-            self.solve(wanted)
+        if self._wanted:
+            self.solve(self._wanted.pop())
         with self._lock:
             if not self.playing:
                 return
@@ -413,19 +433,24 @@ class Viewer:
     def _silently(self) -> _Silence:
         return _Silence(self)
 
+    def _put(self, control: Any, value: Any) -> None:
+        """Set a control; one that acts now is where a person has it, maybe further on already."""
+        if control is not self._acting:
+            control.value = value
+
     def _sync(self) -> None:
         """Bring every control and the scene up to date."""
         p, desk = self.panel, self.desk
         with self._silently(), self.server.atomic():
             for slider, angle in zip(p.angles, np.degrees(desk.q), strict=True):
-                slider.value = float(np.clip(round(angle, 1), slider.min, slider.max))
+                self._put(slider, float(np.clip(round(angle, 1), slider.min, slider.max)))
             for slider, length in zip(p.tendons, 1e3 * desk.displacements, strict=True):
-                slider.value = float(np.clip(round(length, 1), slider.min, slider.max)) + 0.0
-            p.axial.value = desk.axial
+                self._put(slider, float(np.clip(round(length, 1), slider.min, slider.max)) + 0.0)
+            self._put(p.axial, desk.axial)
             p.time.max = max(round(self.duration_s, 2), 0.01)
             p.play.label = "Pause" if self.playing else "Play"
             for box, lost in zip(p.failed, desk.failed, strict=True):
-                box.value = bool(lost)
+                self._put(box, bool(lost))
         self._redraw()
 
     def _redraw(self) -> None:
@@ -442,7 +467,7 @@ class Viewer:
                 q = desk.shape(other.displacements)
                 self.right.draw(other, q, self._looks(other))
                 self.right.title.text, self.right.title.visible = right.name, True
-            p.time.value = min(round(self.time_s, 2), p.time.max)
+            self._put(p.time, min(round(self.time_s, 2), p.time.max))
             p.legend.content = legend_html(p.colour.value, self._most)
             p.readout.content = readout(
                 desk, moment, self.shown_tracks, self.time_s, p.colour.value

@@ -48,7 +48,7 @@ def notice(text: str) -> None:
 
 
 def complain(text: object, advice: str = "") -> None:
-    """Say on standard error, in one line, what is wrong and what to do about it.
+    """Say on standard error what is wrong and what to do about it.
 
     Args:
         text: What is wrong; it may name a command to call, and then says enough.

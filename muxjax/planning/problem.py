@@ -278,8 +278,8 @@ def check_problem(robot: Robot, problem: Problem) -> None:
 
     Raises:
         ValueError: Start or target of wrong length, beyond a tendon's range or in collision, a
-            target bent beyond a segment's limit, an unknown servo or axial position, a term that does
-            not give one value for each transition.
+            target bent beyond a segment's limit, an unknown servo or axial position, or a term
+            that does not give one value for each transition.
     """
     check_ends(robot, "Problem.start", problem.start, "Problem.target", problem.target)
     n_axial, n_servos = robot.axial_map.shape

@@ -404,7 +404,7 @@ def bonus(robot, t):
         ({"target": np.full(9, 0.2)}, r"Problem.target: tendon 1 is at 200 mm, its range is"),
         ({"target": [-0.09, 0.09, 0.09, 0, 0, 0, 0, 0, 0]}, r"segment 1 is .* limit 180"),
         ({"servos": ()}, r"Problem.servos: must be a non-empty set"),
-        ({"servos": (1, 1)}, r"Problem.servos: must be a non-empty set"),
+        ({"servos": (1, 1)}, r"Problem.servos: servo 1 is named twice, found \(1, 1\)"),
         ({"servos": (4,)}, r"Problem.servos: the robot has servos 1 to 3, found 4"),
         ({"servos": (0,)}, r"Problem.servos: the robot has servos 1 to 3, found 0"),
         ({"tolerance": 0.0}, r"Problem.tolerance: must be above 0"),

@@ -75,8 +75,8 @@ BROKEN = [
     (
         "segments.1.theta_max_deg",
         90,
-        r"segments\[2\]\.theta_max_deg: write \{value: 90, source: published \| derived \| assumed, "
-        r"why: \.\.\.\}, found 90$",
+        r"segments\[2\]\.theta_max_deg: write \{value: 90, source: published \| derived \| "
+        r"assumed, why: \.\.\.\}, found 90$",
     ),
     ("servo.speed_rpm", [52], r"servo\.speed_rpm: write \{value: \.\.\., source: .*found \[52\]$"),
     ("segments", [], r"segments: .*at least 1 item"),

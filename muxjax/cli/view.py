@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import numpy as np
 import tyro
 
-from muxjax.cli.output import console, notice
+from muxjax.cli.output import configuration_argument, console, notice
 from muxjax.cli.plans import Method
 from muxjax.cli.poses import Quaternion, Xyz, pose_argument
 from muxjax.collision import load_world
@@ -61,7 +61,8 @@ def view(
     Args:
         files: Programs (muxjax plan --out), plans (--save-plan), trajectories (muxjax export),
             journals and logs of runs (muxjax run --journal, --log).
-        q_deg: Bending angle and azimuth of each segment at first [degrees]; straight by default.
+        q_deg: Bending angle (not negative) and azimuth of each segment at first [degrees]; straight
+            by default.
         xyz_mm: Target of the tool in the world [mm].
         rpy_deg: Its roll, pitch, yaw [degrees]; upright by default.
         quat: Its orientation as a quaternion w x y z instead.
@@ -146,6 +147,7 @@ def _desk(
         track = read_track(arm, path)
         desk.tracks[_unused(track.name, desk.tracks)] = track
     if q_deg is not None:
+        configuration_argument(arm, "--q-deg", q_deg)
         desk.set_q_deg(np.asarray(q_deg))
     every = tuple(range(1, arm.tendons_per_segment + 1))
     for servo in servos or every:

@@ -165,10 +165,15 @@ class Problem:
         if isinstance(self.servos, Iterable):
             servos = tuple(self.servos)
         whole = all(isinstance(s, (int, np.integer)) for s in servos)
-        if not whole or not servos or len(set(servos)) < len(servos):
+        if not whole or not servos:
             raise ValueError(
                 f"Problem.servos: must be a non-empty set of servos, found {self.servos!r}"
             )
+        for servo in servos:
+            if servos.count(servo) > 1:
+                raise ValueError(
+                    f"Problem.servos: servo {servo} is named twice, found {self.servos!r}"
+                )
         return tuple(int(s) for s in self.servos)
 
     def _check_weights(self) -> None:

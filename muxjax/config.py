@@ -27,6 +27,9 @@ _CHECKOUT = Path(__file__).resolve().parent.parent
 _WHEEL = Path(__file__).resolve().parent / "_data"
 
 
+_LEAST_GAP_DEG = 0.1  # between tendons of two segments; 0.05 mm on a circle of 30 mm
+
+
 class ConfigError(ValueError):
     """A configuration file that cannot be used; the message names field, value and limit."""
 
@@ -128,18 +131,35 @@ def replacing(path: str | Path) -> Iterator[Path]:
 
 
 def explain(error: ValidationError) -> str:
-    """Every wrong field of a file with its path, the value found and the limit."""
+    """Every wrong field of a file with its path, the value found and the limit; one a line."""
     lines = []
-    for item in error.errors(include_url=False):
+    items = error.errors(include_url=False)
+    for item in items:
+        if item["type"] == "too_short" and any(_is_within(o["loc"], item["loc"]) for o in items):
+            continue  # wrong items were not counted; they are named themselves
         where = "".join(f"[{p + 1}]" if isinstance(p, int) else f".{p}" for p in item["loc"])
         silent = item["type"] in {"missing", "value_error", "json_invalid"}
         found = "" if silent else f", found {_clipped(item['input'])}"
         message = item["msg"].removeprefix("Value error, ")
+        if item["type"] == "model_type" and item["ctx"]["class_name"].startswith("Sourced"):
+            shown = _clipped(item["input"]) if _is_plain(item["input"]) else "..."
+            message = f"write {{value: {shown}, source: published | derived | assumed, why: ...}}"
         place = where.lstrip(".")
         if not place and item["type"] != "value_error":  # a check across fields names them itself
             place = "file"
         lines.append(f"{place}: {message}{found}" if place else message)
-    return "; ".join(lines)
+    if len(lines) == 1:
+        return lines[0]
+    return "\n  ".join([f"{len(lines)} faults", *lines])
+
+
+def _is_within(inner: tuple[int | str, ...], outer: tuple[int | str, ...]) -> bool:
+    return len(inner) > len(outer) and inner[: len(outer)] == outer
+
+
+def _is_plain(value: object) -> bool:
+    """A number or a word, which a person can be shown how to write."""
+    return isinstance(value, (int, float, str)) and not isinstance(value, bool)
 
 
 def _clipped(value: object, length: int = 80) -> str:
@@ -160,6 +180,7 @@ class Sourced(Strict, Generic[Value]):
 
 Positive = Annotated[float, Field(gt=0)]
 NotNegative = Annotated[float, Field(ge=0)]
+Radius = Annotated[float, Field(gt=0, le=1)]  # [m]; more was meant as millimetres
 Vector3 = tuple[float, float, float]
 
 
@@ -228,7 +249,7 @@ class TendonConfig(Strict):
     """Tendon routing; see MODEL.md section 3 for the azimuth table psi[n, i, j]."""
 
     per_segment: Sourced[Annotated[int, Field(ge=3, le=64)]]
-    radius_m: Sourced[Positive]
+    radius_m: Sourced[Radius]
     routing: Sourced[Literal["parallel", "printed", "table"]]
     azimuth_deg: tuple[tuple[tuple[float, ...], ...], ...] | None = Field(
         default=None, description="psi[n][i][j], only with routing 'table'"
@@ -238,7 +259,7 @@ class TendonConfig(Strict):
 class BodyConfig(Strict):
     """The arm's outer shape and mass."""
 
-    disc_radius_m: Sourced[Positive]
+    disc_radius_m: Sourced[Radius]
     mass_kg: Sourced[Positive]
     driver_payload_kg: Sourced[Positive]
 
@@ -247,7 +268,7 @@ class TransmissionConfig(Strict):
     """From servo shaft to tendon."""
 
     gear_ratio: Sourced[Positive]
-    wheel_radius_m: Sourced[Positive]
+    wheel_radius_m: Sourced[Radius]
 
 
 class ServoConfig(Strict):
@@ -257,6 +278,22 @@ class ServoConfig(Strict):
     rated_torque_nm: Sourced[Positive]
     peak_torque_nm: Sourced[Positive]
     stall_torque_nm: Sourced[Positive]
+
+    @model_validator(mode="after")
+    def _torques_rise(self) -> Self:
+        rated, peak, stall = (
+            torque.value
+            for torque in (self.rated_torque_nm, self.peak_torque_nm, self.stall_torque_nm)
+        )
+        if rated > peak:
+            raise ValueError(
+                f"rated_torque_nm: must not be above peak_torque_nm ({peak:g}), found {rated:g}"
+            )
+        if peak > stall:
+            raise ValueError(
+                f"peak_torque_nm: must not be above stall_torque_nm ({stall:g}), found {peak:g}"
+            )
+        return self
 
 
 class DriveStrengthConfig(Strict):
@@ -288,7 +325,9 @@ class ClutchConfig(Strict):
 
     engage_time_s: Sourced[NotNegative]
     coil_current_a: Sourced[Positive]
-    slip_m: Sourced[NotNegative] = Field(description="tendon change at each switch")
+    slip_m: Sourced[Annotated[float, Field(ge=0, le=0.1)]] = Field(
+        description="tendon change at each switch"
+    )
 
 
 class EncoderConfig(Strict):
@@ -370,6 +409,35 @@ class RobotConfig(Strict):
                     "degrees a disc, must be below 180"
                 )
         return segments
+
+    @model_validator(mode="after")
+    def _tendons_run_inside_the_discs(self) -> Self:
+        circle, disc = self.tendons.radius_m.value, self.body.disc_radius_m.value
+        if circle > disc:
+            raise ValueError(
+                f"tendons.radius_m: must not be above body.disc_radius_m ({disc:g}), the tendons "
+                f"run through the discs; found {circle:g}"
+            )
+        return self
+
+    @model_validator(mode="after")
+    def _tendons_run_side_by_side(self) -> Self:
+        """With parallel runs all tendons pass the base, each at its own azimuth."""
+        if self.tendons.routing.value != "parallel":
+            return self
+        pitch = 360.0 / self.n_servos
+        offsets = [segment.tendon_offset_deg.value for segment in self.segments]
+        for second, at in enumerate(offsets, start=1):
+            for first, other in enumerate(offsets[: second - 1], start=1):
+                gap = abs((at - other + pitch / 2) % pitch - pitch / 2)
+                if gap < _LEAST_GAP_DEG:
+                    raise ValueError(
+                        f"segments[{second}].tendon_offset_deg: the tendons of segments {first} "
+                        f"and {second} lie on each other at the base, {gap:.2g} degrees apart; "
+                        f"must be at least {_LEAST_GAP_DEG:g}, counting modulo {pitch:g}, one "
+                        f"tendon's share; found {other:g} and {at:g}"
+                    )
+        return self
 
     @model_validator(mode="after")
     def _engaging_is_part_of_switching(self) -> Self:

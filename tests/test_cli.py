@@ -277,7 +277,7 @@ def test_a_bus_that_cannot_be_opened_comes_after_the_rehearsal(muxjax, tmp_path,
     ("arguments", "message"),
     [
         (["fk", "60", "0"], "fk: muxarm has 3 segments; give 6 numbers"),
-        (["fk", "nan", "0", "0", "0", "0", "0"], "is nan, must be finite"),
+        (["fk", "nan", "0", "0", "0", "0", "0"], "segment 1, must be finite, found nan"),
         (["fk", "200", "0", "0", "0", "0", "0"], "bending of segment 1 is 200 degrees, limit 180"),
         (["fk", "1", "2", "--robot", "nobody"], "no 'nobody' among the shipped files"),
         (["ik", "--xyz-mm", "0", "0", "5000000"], "millimetres?"),

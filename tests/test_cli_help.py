@@ -99,6 +99,23 @@ def test_the_first_help_has_examples_that_parse(muxjax):
     [
         (("fk", "1", "2", "3"), r"fk: muxarm has 3 segments; give 6 numbers, .*found 3"),
         (("plan", "--q-deg", "60", "0"), r"--q-deg: muxarm has 3 segments; give 6 numbers"),
+        (
+            ("plan", "--q-deg", "60", "0", "-25", "20", "0", "0"),
+            r"--q-deg: number 3, the bending angle of segment 2, must be at least 0, found -25; "
+            r"bend the other way: theta 25, phi \+ 180",
+        ),
+        (
+            ("view", "--q-deg", "-25", "0", "0", "20", "0", "0"),
+            r"--q-deg: number 1, the bending angle of segment 1, must be at least 0",
+        ),
+        (
+            ("fk", "60", "0", "75", "nan", "40", "0"),
+            r"fk: number 4, the azimuth of segment 2, must be finite, found nan",
+        ),
+        (
+            ("plan", "--q-deg", "60", "0", "5", "-20", "0", "0", "--servos", "1", "1"),
+            r"servos: servo 1 is named twice",
+        ),
         (("urdf", "--q-deg", "60", "0"), r"--q-deg: muxarm has 3 segments; give 6 numbers"),
         (("figure", "fig6", "--q-deg", "1"), r"--q-deg: muxarm has 3 segments; give 6 numbers"),
         (("run", "nope.json"), r"nope\.json: cannot be read .*; muxjax plan --out writes programs"),

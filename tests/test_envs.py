@@ -118,6 +118,12 @@ def test_return_is_minus_the_cost_of_the_plan(objective, method, max_step_mm, mu
         assert bool(outcomes[-1].solved)
 
 
+def test_a_term_that_does_not_give_one_value_for_each_transition_is_refused():
+    terms = {"foo": lambda robot, t: jnp.sum(t.after**2)}
+    with pytest.raises(ConfigError, match=r"Problem.terms\['foo'\]: returned shape \(\)"):
+        Tdma(config(weights={"foo": 1.0}), terms)
+
+
 def test_penta_returns_the_cost_of_its_plans(rng):
     robot = muxjax.load_robot("penta")
     env = Tdma(config(robot="penta"))

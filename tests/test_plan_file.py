@@ -60,7 +60,7 @@ def test_a_plan_of_no_steps_survives_too(muxarm, tmp_path):
         (("displacements_m", -1, 4), 0.5, r"off the problem's target, tolerance 1e-05"),
         (("problem", "action_set"), "any", r"action_set: must be one of subsets, .*found 'any'"),
         (("problem", "weights"), {"beauty": 1}, r"weights: no term 'beauty' among"),
-        (("problem", "servos"), [1, 1], r"servos: must be a non-empty set"),
+        (("problem", "servos"), [1, 1], r"servos: servo 1 is named twice"),
     ],
 )
 def test_a_wrong_file_is_refused_by_field(plan, tmp_path, path, value, message):

@@ -11,16 +11,19 @@ from pathlib import Path
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import muxjax
-from muxjax.planning import METHODS, PlanningError, Problem, plan, plan_each
+from muxjax.metrics import program_cost
+from muxjax.planning import METHODS, PlanningError, Problem, plan, plan_batch, plan_each
 from muxjax.planning.axial import fewest_repositionings
 from muxjax.planning.bounds import AdmissibleBound
 from muxjax.planning.lattice import Lattice
 from muxjax.planning.motion import angles_at, leg_time, relative_excess
 from muxjax.planning.table import LatticeTable
+from muxjax.planning.terms import step, transition_shapes
 from muxjax.robot import Robot
 from tests.beam_oracle import beam
 
@@ -401,7 +404,7 @@ def bonus(robot, t):
         ({"target": np.full(9, 0.2)}, r"Problem.target: tendon 1 is at 200 mm, its range is"),
         ({"target": [-0.09, 0.09, 0.09, 0, 0, 0, 0, 0, 0]}, r"segment 1 is .* limit 180"),
         ({"servos": ()}, r"Problem.servos: must be a non-empty set"),
-        ({"servos": (1, 1)}, r"Problem.servos: must be a non-empty set"),
+        ({"servos": (1, 1)}, r"Problem.servos: servo 1 is named twice, found \(1, 1\)"),
         ({"servos": (4,)}, r"Problem.servos: the robot has servos 1 to 3, found 4"),
         ({"servos": (0,)}, r"Problem.servos: the robot has servos 1 to 3, found 0"),
         ({"tolerance": 0.0}, r"Problem.tolerance: must be above 0"),
@@ -455,6 +458,65 @@ def test_a_users_term_that_is_not_a_cost_is_refused(muxarm, rng):
         bad = Problem(np.zeros(9), target, weights={"mine": 1.0}, terms={"mine": bonus})
         with pytest.raises(PlanningError, match="a cost term is negative"):
             plan(muxarm, bad, method)
+
+
+WRONG_TERMS = [
+    (
+        lambda robot, t: jnp.sum(t.after**2),
+        r"returned shape \(\), .*, shape \(3,\); sum over axis=-1",
+    ),
+    (
+        lambda robot, t: t.after**2,
+        r"returned shape \(3, 9\), must be one value for each transition",
+    ),
+    (lambda robot, t: jnp.sum(t.theta_after, axis=0), r"returned shape \(5, 3\), .*shape \(2, 5\)"),
+    (lambda robot, t: 1.0, r"returned shape \(\)"),
+    (lambda robot, t: (t.wait, t.wait), "must return one array, found tuple"),
+    (
+        lambda robot, t: np.linalg.norm(t.after, axis=-1),
+        "needs the numbers .*; write it with jax.numpy",
+    ),
+    (
+        lambda robot, t: t.wait if (t.wait > 0).any() else t.duration,
+        "needs .*jax.numpy.where for an if",
+    ),
+]
+
+
+@pytest.mark.parametrize(("term", "message"), WRONG_TERMS)
+def test_a_term_gives_one_value_for_each_transition(muxarm, term, message):
+    target = np.full(9, -0.001)
+    fields = {"weights": {"foo": 1.0}, "terms": {"foo": term}}
+    found = r"Problem.terms\['foo'\]: " + message
+    for method in METHODS:
+        with pytest.raises(ValueError, match=found):
+            plan(muxarm, Problem(np.zeros(9), target, **fields), method)
+    with pytest.raises(ValueError, match=found):
+        plan_batch(muxarm, np.zeros(9), [target], **fields)
+    with pytest.raises(ValueError, match=found):
+        plan_each(muxarm, [Problem(np.zeros(9), target, **fields)])
+    program = muxjax.schedule(muxarm, plan(muxarm, Problem(np.zeros(9), target)))
+    with pytest.raises(ValueError, match=found):
+        program_cost(muxarm, Problem(np.zeros(9), target, **fields), program)
+
+
+def test_a_fault_in_a_term_names_the_term(muxarm):
+    fields = {"weights": {"foo": 1.0}, "terms": {"foo": lambda robot, t: t.waiting}}
+    with pytest.raises(AttributeError) as caught:
+        plan(muxarm, Problem(np.zeros(9), np.full(9, -0.001), **fields))
+    notes = "".join(caught.value.__notes__)
+    assert "in Problem.terms['foo'], asked about transitions of shape (3,)" in notes
+
+
+@pytest.mark.parametrize("batch", [(3,), (2, 5)])
+def test_terms_are_checked_on_transitions_as_steps_make_them(robot, batch):
+    moves, flags = np.zeros((*batch, robot.n_tendons)), np.zeros(batch)
+    with jax.enable_x64(True):
+        goal = np.zeros(robot.n_segments)
+        made = jax.eval_shape(step, robot, moves, moves, flags, flags, goal)
+        shapes = jax.tree.map(lambda x: (x.shape, x.dtype), made._asdict())
+    expected = transition_shapes(robot, batch)._asdict()
+    assert shapes == jax.tree.map(lambda x: (x.shape, x.dtype), expected)
 
 
 def test_a_problem_keeps_its_own_copy(muxarm, rng):

@@ -72,7 +72,41 @@ BROKEN = [
     ("segments.0.length_m.source", "guessed", r"length_m\.source: .*'published', 'derived' or"),
     ("segments.0.length_m.why", "", r"segments\[1\]\.length_m\.why: .*at least 3"),
     ("segments.0.length_m", 0.17, r"segments\[1\]\.length_m: .*found 0\.17"),
+    (
+        "segments.1.theta_max_deg",
+        90,
+        r"segments\[2\]\.theta_max_deg: write \{value: 90, source: published \| derived \| "
+        r"assumed, why: \.\.\.\}, found 90$",
+    ),
+    ("servo.speed_rpm", [52], r"servo\.speed_rpm: write \{value: \.\.\., source: .*found \[52\]$"),
     ("segments", [], r"segments: .*at least 1 item"),
+    ("segments.0.length_m.value", 169.2, r"length_m\.value: .*less than or equal to 10"),
+    ("tendons.radius_m.value", 30, r"tendons\.radius_m\.value: .*equal to 1, found 30$"),
+    ("body.disc_radius_m.value", 35, r"body\.disc_radius_m\.value: .*equal to 1, found 35$"),
+    ("transmission.wheel_radius_m.value", 25, r"wheel_radius_m\.value: .*equal to 1, found 25$"),
+    ("clutch.slip_m.value", 0.5, r"clutch\.slip_m\.value: .*equal to 0\.1, found 0\.5$"),
+    (
+        "body.disc_radius_m.value",
+        0.029,
+        r"tendons\.radius_m: must not be above body\.disc_radius_m \(0\.029\).*found 0\.03$",
+    ),
+    (
+        "servo.rated_torque_nm.value",
+        2.5,
+        r"servo: rated_torque_nm: must not be above peak_torque_nm \(2\.26\), found 2\.5$",
+    ),
+    (
+        "servo.peak_torque_nm.value",
+        5,
+        r"servo: peak_torque_nm: must not be above stall_torque_nm \(4\.9\), found 5$",
+    ),
+    (
+        "segments.1.tendon_offset_deg.value",
+        -119.95,
+        r"segments\[2\]\.tendon_offset_deg: the tendons of segments 1 and 2 lie on each other.* "
+        r"0\.05 degrees apart; must be at least 0\.1, .*modulo 120, .*found 0 and -119\.95",
+    ),
+    ("segments.2.tendon_offset_deg.value", 160, r"the tendons of segments 2 and 3 lie on each"),
     ("transmission.gear_ratio", None, r"transmission\.gear_ratio: Field required"),
     ("tendons.per_segment.value", 2, r"tendons\.per_segment\.value: .*equal to 3.*found 2"),
     ("tendons.radius_m.value", 0, r"tendons\.radius_m\.value: .*greater than 0.*found 0"),
@@ -109,8 +143,13 @@ def test_a_wrong_file_fails_with_field_value_and_limit(muxarm_raw, tmp_path, pat
 def test_every_wrong_field_is_listed(muxarm_raw, tmp_path):
     put(muxarm_raw, "segments.0.length_m.value", -1)
     put(muxarm_raw, "servo.speed_rpm.value", 0)
-    with pytest.raises(ConfigError, match=r"segments\[1\]\.length_m.*; servo\.speed_rpm"):
+    with pytest.raises(ConfigError) as caught:
         load(muxarm_raw, tmp_path)
+    first, *lines = str(caught.value).splitlines()
+    assert first.endswith("robot.yaml: 2 faults")
+    assert lines[0].startswith("  segments[1].length_m.value: ")
+    assert lines[1].startswith("  servo.speed_rpm.value: ")
+    assert len(lines) == 2  # and none of a list that were too short without its wrong items
 
 
 @pytest.mark.parametrize(
@@ -197,7 +236,7 @@ def test_fingerprint_follows_values_and_not_reasons(raw):
 
 def test_robots_compare_and_hash_by_their_values(raw):
     one, same = RobotConfig.model_validate(raw), RobotConfig.model_validate(raw)
-    put(raw, "tendons.radius_m.value", 0.031)
+    put(raw, "tendons.radius_m.value", 0.024)
     other = RobotConfig.model_validate(raw)
     assert one == same
     assert hash(one) == hash(same)
@@ -218,6 +257,18 @@ def test_printed_routing_differs_only_through_proximal_segments(raw):
     change = muxjax.tendon_displacements(printed, q) - muxjax.tendon_displacements(parallel, q)
     np.testing.assert_allclose(change[:j], 0, atol=1e-15)
     assert (np.abs(change[j:]) > 1e-4).all()
+
+
+@pytest.mark.parametrize("routing", ["printed", "table"])
+def test_only_parallel_tendons_need_azimuths_of_their_own(muxarm_raw, tmp_path, routing):
+    put(muxarm_raw, "segments.1.tendon_offset_deg.value", 0)
+    with pytest.raises(ConfigError, match="lie on each other"):
+        load(muxarm_raw, tmp_path)
+    put(muxarm_raw, "tendons.routing.value", routing)
+    if routing == "table":
+        table = [[[40.0 * i + 120 * j for j in range(3)] for i in range(3)] for _ in range(3)]
+        put(muxarm_raw, "tendons.azimuth_deg", table)
+    assert load(muxarm_raw, tmp_path).n_segments == 3
 
 
 def test_an_azimuth_table_is_used_and_checked(muxarm_raw, tmp_path):

@@ -51,7 +51,7 @@ def fig6(
         out: File to write: .pdf or .svg (vector), or .png.
         target: Which of the comparison's random targets (muxjax bench table2), from 1.
         seed: Of those targets.
-        q_deg: Bending angle and azimuth of each segment [degrees] instead.
+        q_deg: Bending angle (not negative) and azimuth of each segment [degrees] instead.
         protocol: Shipped protocol or path of a YAML file: the planners' settings.
         robot: Shipped robot or path of a YAML file.
         json: Print the figure's numbers as JSON in SI units.

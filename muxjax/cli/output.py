@@ -48,7 +48,7 @@ def notice(text: str) -> None:
 
 
 def complain(text: object, advice: str = "") -> None:
-    """Say on standard error, in one line, what is wrong and what to do about it.
+    """Say on standard error what is wrong and what to do about it.
 
     Args:
         text: What is wrong; it may name a command to call, and then says enough.
@@ -69,7 +69,8 @@ def configuration_argument(robot: Robot, option: str, q_deg: Sequence[float]) ->
     """A configuration [rad] typed as bending angle and azimuth of each segment [degrees].
 
     Raises:
-        ValueError: Another count of numbers, or bending beyond a segment's limit.
+        ValueError: Another count of numbers, one that is not finite, or bending that is negative or
+            beyond a segment's limit.
     """
     count = 2 * robot.n_segments
     if len(q_deg) != count:
@@ -77,6 +78,20 @@ def configuration_argument(robot: Robot, option: str, q_deg: Sequence[float]) ->
             f"{option}: {robot.config.name} has {robot.n_segments} segments; give {count} numbers, "
             f"bending angle and azimuth of each [degrees], found {len(q_deg)}"
         )
+    for place, value in enumerate(q_deg):
+        segment, is_azimuth = place // 2 + 1, place % 2
+        if not math.isfinite(value):
+            what = "azimuth" if is_azimuth else "bending angle"
+            raise ValueError(
+                f"{option}: number {place + 1}, the {what} of segment {segment}, must be finite, "
+                f"found {value:g}"
+            )
+        # The model has one name for each shape; a minus sign may as well be a slip of the hand.
+        if value < 0 and not is_azimuth:
+            raise ValueError(
+                f"{option}: number {place + 1}, the bending angle of segment {segment}, must be at "
+                f"least 0, found {value:g}; bend the other way: theta {-value:g}, phi + 180"
+            )
     return check_configuration(robot, np.radians(np.asarray(q_deg, dtype=float)))
 
 

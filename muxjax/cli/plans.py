@@ -55,7 +55,7 @@ def plan(
         xyz_mm: Tool position in the world [mm].
         rpy_deg: Roll, pitch, yaw [degrees]; upright by default.
         quat: Orientation as a quaternion w x y z instead.
-        q_deg: Bending angle and azimuth of each segment [degrees], instead of a pose.
+        q_deg: Bending angle (not negative) and azimuth of each segment [degrees], not a pose.
         poses: Shipped task or path of a YAML file, whose targets are passed in order, instead.
         servos: Available servos; all by default.
         method: Planner.

@@ -43,7 +43,7 @@ def fk(
     Example: muxjax fk 60 0  75 180  40 0
 
     Args:
-        q_deg: Bending angle and azimuth of each segment [degrees], base to tip.
+        q_deg: Bending angle (not negative) and azimuth of each segment [degrees], base to tip.
         robot: Shipped robot or path of a YAML file.
         json: Print JSON in SI units.
     """

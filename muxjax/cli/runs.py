@@ -66,7 +66,7 @@ def run(
         xyz_mm: Instead of a program: tool position in the world [mm].
         rpy_deg: Roll, pitch, yaw [degrees]; upright by default.
         quat: Orientation as a quaternion w x y z instead.
-        q_deg: Bending angle and azimuth of each segment [degrees], instead of a pose.
+        q_deg: Bending angle (not negative) and azimuth of each segment [degrees], not a pose.
         servos: Available servos, for the plan; all by default.
         planner: Method of the plan, and of new ones.
         preset: Weights of their cost: paper, fastest, no-overshoot, or a YAML file.

@@ -27,7 +27,8 @@ def urdf(
     Args:
         out: File to write.
         per_segment: Two-axis joints a segment; even numbers are more exact.
-        q_deg: Print the joints' angles at this bending angle and azimuth of each segment [degrees].
+        q_deg: Print the joints' angles at this bending angle (not negative) and azimuth of each
+            segment [degrees].
         robot: Shipped robot or path of a YAML file.
         json: Print JSON, angles in rad.
     """

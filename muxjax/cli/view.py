@@ -61,7 +61,8 @@ def view(
     Args:
         files: Programs (muxjax plan --out), plans (--save-plan), trajectories (muxjax export),
             journals and logs of runs (muxjax run --journal, --log).
-        q_deg: Bending angle and azimuth of each segment at first [degrees]; straight by default.
+        q_deg: Bending angle (not negative) and azimuth of each segment at first [degrees]; straight
+            by default.
         xyz_mm: Target of the tool in the world [mm].
         rpy_deg: Its roll, pitch, yaw [degrees]; upright by default.
         quat: Its orientation as a quaternion w x y z instead.

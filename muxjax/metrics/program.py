@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float
 
 from muxjax.kinematics import forward_kinematics
 from muxjax.planning.motion import STRAIGHT, angles_at, bending_angles, overshoot_profile
-from muxjax.planning.problem import Problem, Transition, step
+from muxjax.planning.problem import Problem, Transition, check_own_terms, step
 from muxjax.planning.terms import CostTerm
 from muxjax.precision import host_array, pad_rows
 from muxjax.robot import Robot
@@ -192,8 +192,10 @@ def program_cost(robot: Robot, problem: Problem, program: Program) -> float:
     """The problem's objective on a program: each leg is one step.
 
     Raises:
-        ValueError: The program was made for another robot.
+        ValueError: The program was made for another robot, or one of the problem's own terms does
+            not give one value for each transition.
     """
+    check_own_terms(robot, problem)
     legs = [(v[:-1], v[1:]) for v in waypoints(robot, program)]
     if not legs:
         return 0.0

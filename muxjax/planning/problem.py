@@ -30,6 +30,7 @@ from muxjax.planning.terms import (
     CostTerm,
     Term,
     Transition,
+    check_terms,
     is_expensive,
     step,
     traced,
@@ -97,8 +98,8 @@ class Problem:
         tolerance: The target is reached when no tendon is further off than this [m].
         preset: Name of a shipped set of weights, or the path of a YAML file.
         weights: Weights by term name instead of a preset.
-        terms: Your own cost terms by name, beside those of ``TERMS``; none may be negative, and
-            one that is not finite forbids its step.
+        terms: Your own cost terms by name, beside those of ``TERMS``; each gives one value for each
+            transition, none may be negative, and one that is not finite forbids its step.
         world: Obstacles. A step that passes through a collision is then forbidden, and the term
             "clearance" (``world.Clearance``) may have a weight.
         axial: Axial position now, if known; otherwise the first step repositions.
@@ -164,10 +165,15 @@ class Problem:
         if isinstance(self.servos, Iterable):
             servos = tuple(self.servos)
         whole = all(isinstance(s, (int, np.integer)) for s in servos)
-        if not whole or not servos or len(set(servos)) < len(servos):
+        if not whole or not servos:
             raise ValueError(
                 f"Problem.servos: must be a non-empty set of servos, found {self.servos!r}"
             )
+        for servo in servos:
+            if servos.count(servo) > 1:
+                raise ValueError(
+                    f"Problem.servos: servo {servo} is named twice, found {self.servos!r}"
+                )
         return tuple(int(s) for s in self.servos)
 
     def _check_weights(self) -> None:
@@ -277,7 +283,8 @@ def check_problem(robot: Robot, problem: Problem) -> None:
 
     Raises:
         ValueError: Start or target of wrong length, beyond a tendon's range or in collision, a
-            target bent beyond a segment's limit, an unknown servo or axial position.
+            target bent beyond a segment's limit, an unknown servo or axial position, or a term
+            that does not give one value for each transition.
     """
     check_ends(robot, "Problem.start", problem.start, "Problem.target", problem.target)
     n_axial, n_servos = robot.axial_map.shape
@@ -288,8 +295,20 @@ def check_problem(robot: Robot, problem: Problem) -> None:
         raise ValueError(
             f"Problem.axial: the robot has positions 1 to {n_axial}, found {problem.axial}"
         )
+    check_own_terms(robot, problem)
     if problem.world is not None:
         _check_clear(robot, problem, problem.world)
+
+
+def check_own_terms(robot: Robot, problem: Problem) -> None:
+    """Whether each of a problem's own terms gives one value for each transition.
+
+    Raises:
+        ValueError: One does not; see ``terms.check_terms``.
+    """
+    # The shipped class is known to be right, and takes most of a second to trace.
+    own = {name: term for name, term in problem.terms.items() if type(term) is not Tension}
+    check_terms(robot, own)
 
 
 def check_ends(robot: Robot, start_name: str, start: Any, target_name: str, target: Any) -> None:

@@ -18,7 +18,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from muxjax.planning.motion import angles_along, bending_angles, leg_time, relative_excess
+from muxjax.planning.motion import (
+    LEG_POINTS,
+    angles_along,
+    bending_angles,
+    leg_time,
+    relative_excess,
+)
 from muxjax.robot import Robot
 
 Array = jax.Array | np.ndarray
@@ -127,6 +133,78 @@ def traced(function: Callable[..., Any]) -> Traced:
 
 def _is_traced(leaf: object) -> bool:
     return isinstance(leaf, (jax.Array, np.ndarray, np.generic, float))
+
+
+def check_terms(robot: Robot, terms: Mapping[str, Term]) -> None:
+    """Look at the shapes that a user's terms return; nothing is computed.
+
+    A term that forgets an axis would be spread over the batch, and plans be certified for another
+    cost than was meant. Each is traced once; after that the compiler's cache knows it.
+
+    Raises:
+        ValueError: A term that is no function, does not return one value for each transition, or
+            needs the numbers in its arrays.
+    """
+    for name, term in terms.items():
+        where = f"Problem.terms[{name!r}]"
+        if not callable(term):
+            raise ValueError(f"{where}: must be a function of (robot, transition), found {term!r}")
+        for batch in ((3,), (2, 5)):  # planners ask in batches of one axis and of more
+            found = _traced_shape(robot, term, where, batch)
+            if not isinstance(found, jax.ShapeDtypeStruct):
+                raise ValueError(f"{where}: must return one array, found {type(found).__name__}")
+            if found.shape != batch:
+                raise ValueError(
+                    f"{where}: returned shape {found.shape}, must be one value for each "
+                    f"transition, shape {batch}; sum over axis=-1"
+                )
+
+
+def _traced_shape(robot: Robot, term: Term, where: str, batch: tuple[int, ...]) -> Any:
+    try:
+        with jax.enable_x64(True):
+            return _value.eval_shape(robot, traced(term), transition_shapes(robot, batch))
+    except (
+        jax.errors.TracerArrayConversionError,
+        jax.errors.TracerIntegerConversionError,
+        jax.errors.ConcretizationTypeError,
+    ):
+        raise ValueError(
+            f"{where}: needs the numbers in its arrays, which are not known while it is compiled; "
+            "write it with jax.numpy (jax.numpy.where for an if), not with numpy, math or float()"
+        ) from None
+    except Exception as error:
+        error.add_note(f"in {where}, asked about transitions of shape {batch}")
+        raise
+
+
+@jax.jit
+def _value(robot: Robot, term: Traced, t: Transition) -> Any:
+    return term(robot, t)
+
+
+def transition_shapes(robot: Robot, batch: tuple[int, ...]) -> Transition:
+    """The shapes of what ``step`` makes of a batch of moves towards one goal."""
+
+    def numbers(*shape: int) -> Any:
+        return jax.ShapeDtypeStruct(shape, np.float64)
+
+    displacements, each = numbers(*batch, robot.n_tendons), numbers(*batch)
+    angles = numbers(*batch, robot.n_segments)
+    return Transition(
+        before=displacements,
+        after=displacements,
+        repositions=each,
+        wait=each,
+        duration=each,
+        goal=numbers(robot.n_segments),
+        theta_before=angles,
+        theta_after=angles,
+        theta_along=numbers(*batch, LEG_POINTS, robot.n_segments),
+        excess_before=each,
+        excess_mean=each,
+        excess_peak=each,
+    )
 
 
 def is_expensive(term: Term) -> bool:

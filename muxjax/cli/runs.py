@@ -15,7 +15,7 @@ import tyro
 from rich.table import Table
 
 from muxjax.cli.output import console, notice, print_json, verdict
-from muxjax.cli.plans import Method, plan_to_configuration, problem_fields
+from muxjax.cli.plans import Method, plan_to_configuration, problem_fields, start_fields
 from muxjax.cli.poses import Quaternion, Xyz, pose_argument
 from muxjax.cli.progress import Reporter
 from muxjax.hardware import BusLink, Journal, Link, LockstepLink, MemoryJournal, Progress, Run
@@ -34,6 +34,8 @@ def run(
     rpy_deg: Xyz | None = None,
     quat: Quaternion | None = None,
     q_deg: tuple[float, ...] | None = None,
+    start_q_deg: tuple[float, ...] | None = None,
+    after: Path | None = None,
     servos: tuple[int, ...] | None = None,
     planner: Method = "exact",
     preset: str = "paper",
@@ -61,15 +63,19 @@ def run(
 
     Example: muxjax run program.json --bus lab --journal arm.journal
 
+    Example: muxjax run --q-deg 0 0 0 0 0 0 --after program.json --bus lab
+
     Args:
         program: File written by muxjax plan --out.
         xyz_mm: Instead of a program: tool position in the world [mm].
         rpy_deg: Roll, pitch, yaw [degrees]; upright by default.
         quat: Orientation as a quaternion w x y z instead.
         q_deg: Bending angle and azimuth of each segment [degrees], instead of a pose.
+        start_q_deg: Where the arm stands, for the plan [degrees]; straight by default.
+        after: The program after which the plan starts, instead; not the one to run.
         servos: Available servos, for the plan; all by default.
-        planner: Method of the plan, and of new ones.
-        preset: Weights of their cost: paper, fastest, no-overshoot, or a YAML file.
+        planner: Method of the plan, and of new ones; muxjax plan calls it --method.
+        preset: Weights of their cost: paper, fastest, no-overshoot, gentle, or a YAML file.
         max_step_mm: Greatest tendon displacement in one of their steps [mm]; no limit by default.
         world: Shipped world or path of a YAML file, of which every step they make must be clear.
         robot: Shipped robot or path of a YAML file; a program runs only on its own robot.
@@ -90,16 +96,22 @@ def run(
         raise ValueError("run: only --xyz-mm takes --rpy-deg or --quat")
     if mapping is not None and bus is None:
         raise ValueError("run: --mapping is of the board on --bus")
+    if program is not None and not (start_q_deg is None and after is None):
+        raise ValueError(
+            f"run: {program} has its own start; --start-q-deg and --after are for a plan to "
+            "--xyz-mm or --q-deg"
+        )
     arm = load_robot(robot)
     fields = problem_fields(arm, servos, preset, max_step_mm, world)
+    begin = start_fields(arm, start_q_deg, after)
     if program is not None:
         loaded = load_program(program)
     else:
         if xyz_mm is None:
-            found = plan_to_configuration(arm, q_deg, planner, fields)
+            found = plan_to_configuration(arm, q_deg, planner, begin | fields)
         else:
             pose = pose_argument(xyz_mm, rpy_deg, quat)
-            found = plan_to_pose(arm, pose, method=planner, **fields).plan
+            found = plan_to_pose(arm, pose, method=planner, **begin, **fields).plan
         loaded = schedule(arm, found)
     check_same_robot(arm, loaded)
     translation = None if mapping is None else Translation(mapping)
@@ -151,8 +163,8 @@ def resume(
         journal: File that muxjax run has written.
         bus: As for muxjax run.
         robot: Shipped robot or path of a YAML file.
-        planner: Method of new plans.
-        preset: Weights of their cost: paper, fastest, no-overshoot, or a YAML file.
+        planner: Method of new plans; muxjax plan calls it --method.
+        preset: Weights of their cost: paper, fastest, no-overshoot, gentle, or a YAML file.
         max_step_mm: Greatest tendon displacement in one of their steps [mm]; no limit by default.
         world: Shipped world or path of a YAML file, of which every step of theirs must be clear.
         log: File for every frame, as candump -L writes it; it grows if it exists.

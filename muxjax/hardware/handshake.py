@@ -259,7 +259,13 @@ class Handshake(Session):
 
     def _refuse(self, check: Check, expected: Standing) -> None:
         text = f"{check.name}: {check.detail}"
-        if check.name in ("program.start", "lengths"):
+        if check.name == "program.start":
+            raise Wrong(
+                f"{text}; plan from where the arm stands: muxjax plan --after PROGRAM or "
+                "--start-q-deg, in Python Problem(start, ...). A virtual board made in Python "
+                "stands straight unless LockstepLink(robot, displacements=program.start) says so"
+            )
+        if check.name == "lengths":
             raise Wrong(text)
         if check.name == "servos":
             raise Failed(text, After.REPAIR, servo=self._silent_servos(expected)[0])

@@ -305,6 +305,9 @@ def test_a_dry_run_opens_no_bus_and_leaves_journal_and_log(muxjax, tmp_path):
         assert frames.readline().startswith("(0.000000) can0 020#")
     with Journal.open(journal) as kept:
         assert kept.standing.completed
+    code, out, err = muxjax("run", path, "--log", log)
+    assert (code, out) == (2, "")
+    assert "give another name, or remove the file" in err
 
 
 def test_new_plans_are_made_as_the_command_line_says(muxjax, tmp_path, monkeypatch):

@@ -85,7 +85,8 @@ def run(
         rehearse: The virtual board first, before --bus is opened.
         physics: Of the virtual board: ideal, realistic, harsh, or a YAML file.
         journal: File for muxjax resume; on a bus run.journal by default.
-        log: File for every frame of the run, as candump -L writes it.
+        log: File for every frame of the run, as candump -L writes it. On a bus it grows if it
+            exists; the virtual board, whose clock begins at 0, needs a new one.
         stream_divider: Feedback at 1 / this of its rates, for slow serial links.
         mapping: YAML file of a lab's own DBC that the board on --bus speaks.
         json: Print JSON in SI units.

@@ -27,6 +27,11 @@ from muxjax.program_file import load_program
 from muxjax.robot import Robot, load_robot
 from muxjax.scheduler import Program, check_same_robot, schedule
 
+_POWER_UP = (
+    "ESTOP holds until the board's power-up: switch it off and on (end and restart muxjax board); "
+    "then "
+)
+
 
 def run(
     program: Annotated[Path | None, tyro.conf.Positional] = None,
@@ -129,6 +134,8 @@ def run(
                 done = go_logged(virtual, log, 0.0, lambda link: go(link, into, tell))
             return report(done, loaded, json)
         done = go(virtual, MemoryJournal(), None)
+        if done.interrupted:
+            raise KeyboardInterrupt
         if not done.completed:
             raise ValueError(f"run: the rehearsal on the virtual board failed: {done.reason}")
         notice(f"rehearsed on the virtual board: {done.duration_s:.2f} s")
@@ -232,6 +239,7 @@ def go_logged(link: Link, log: Path | None, begin_s: float, go: Callable[[Link],
 def report(done: Run, program: Program, json: bool, journal: Path | None = None) -> int:
     """Print how a run went; its exit code."""
     error = np.abs(done.measured - np.array(program.target))
+    code = 0 if done.completed else 130 if done.interrupted else 1
     if json:
         print_json(
             {
@@ -239,6 +247,7 @@ def report(done: Run, program: Program, json: bool, journal: Path | None = None)
                 "completed": done.completed,
                 "reason": done.reason,
                 "resumable": done.resumable,
+                "estopped": done.estopped,
                 "failed_servos": done.failed_servos,
                 "duration_s": done.duration_s,
                 "measured_m": done.measured,
@@ -247,19 +256,26 @@ def report(done: Run, program: Program, json: bool, journal: Path | None = None)
                 "preflight": [dataclasses.asdict(check) for check in done.checks],
             }
         )
-        return 0 if done.completed else 1
-    table = Table("stage", "axial", "begin [s]", "end [s]", "trims")
-    for number, r in enumerate(done.records, start=1):
-        table.add_row(str(number), str(r.axial), f"{r.start_s:.2f}", f"{r.end_s:.2f}", str(r.trims))
-    console.print(table)
-    console.print(
-        verdict(done.reason, done.completed)
-        + f": {done.duration_s:.2f} s on the board's clock, wheels within "
-        f"{1e3 * np.max(error):.3f} mm of the target"
-    )
+        return code
+    if done.records:
+        table = Table("instruction", "axial", "begin [s]", "end [s]", "trims")
+        for r in done.records:
+            times = f"{r.start_s:.2f}", f"{r.end_s:.2f}"
+            table.add_row(str(r.number), str(r.axial), *times, str(r.trims))
+        console.print(table)
+    if np.isnan(done.duration_s):
+        how = "the board did not arm"
+    elif done.completed and not done.records:
+        how = "nothing was left to do"
+    else:
+        how = f"{done.duration_s:.2f} s on the board's clock"
+    if np.isfinite(error).all():
+        how += f", wheels within {1e3 * np.max(error):.3f} mm of the target"
+    console.print(verdict(done.reason, done.completed) + f": {how}")
     if done.failed_servos:
         console.print(f"failed servos: {' '.join(map(str, done.failed_servos))}")
     if journal is not None and not done.completed:
         what = "goes on" if done.resumable else "goes on once the part is repaired"
-        console.print(f"muxjax resume {journal} --bus ... {what}")
-    return 0 if done.completed else 1
+        first = _POWER_UP if done.estopped else ""
+        console.print(f"{first}muxjax resume {journal} --bus ... {what}", soft_wrap=True)
+    return code

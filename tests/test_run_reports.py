@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import json
+import re
 
 import pytest
 from test_executor import program, visit
 
 from muxjax.cli import main, runs
 from muxjax.cli.progress import Reporter
-from muxjax.hardware import LockstepLink
-from muxjax.program_file import save_program
+from muxjax.hardware import Journal, LockstepLink
+from muxjax.hardware.executor import begin
+from muxjax.program_file import load_program, save_program
+from muxjax.robot import load_robot
 
 OPTIONS = ("--bus", "a wire", "--journal")
 
@@ -115,3 +118,18 @@ def test_ctrl_c_in_the_rehearsal_is_130_and_opens_no_bus(bench, monkeypatch):
     code, out, err = call("run", "program.json", *OPTIONS, "arm.journal")
     assert (code, out, opened) == (130, "", [])
     assert "interrupted" in err
+
+
+def test_a_journal_and_a_program_are_told_apart(bench):
+    _, call = bench
+    with Journal.open("arm.journal") as journal:
+        begin(load_robot("muxarm"), load_program("program.json"), journal)
+    for arguments, message in (
+        (("resume", "program.json", "--bus", "a wire"), r"this is a program, which muxjax run"),
+        (("run", "program.json", *OPTIONS, "program.json"), r"line 1: not that of a journal"),
+        (("run", "arm.journal"), r"arm\.journal: is a journal; muxjax resume goes on with it"),
+        (("export", "arm.journal", "--out", "a.csv"), r"is the journal.*muxjax run --log"),
+    ):
+        code, out, err = call(*arguments)
+        assert (code, out) == (2, "")
+        assert re.search(message, err.strip().splitlines()[-1])

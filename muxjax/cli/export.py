@@ -9,6 +9,7 @@ from typing import Annotated
 import tyro
 
 from muxjax.cli.output import console, notice, print_json
+from muxjax.hardware.journal import is_journal
 from muxjax.metrics.program import timeline
 from muxjax.plan_file import load_plan
 from muxjax.program_file import load_program, save_program
@@ -60,6 +61,11 @@ def export(
         if out.suffix == ".json":
             raise ValueError(f"--out: a run is no program; {out} must end in .csv, .npz or .mcap")
         document, text = _write_run(arm, source, out, rate_hz, per_segment)
+    elif is_journal(source):
+        raise ValueError(
+            f"{source}: is the journal of a run and has no clock; export takes the run's frames, "
+            "which muxjax run --log FILE.log writes"
+        )
     else:
         document, text = _write_program(arm, _program(arm, source), out, rate_hz, per_segment)
     if json:

@@ -19,6 +19,7 @@ from muxjax.cli.plans import Method, plan_to_configuration, problem_fields, star
 from muxjax.cli.poses import Quaternion, Xyz, pose_argument
 from muxjax.cli.progress import Reporter
 from muxjax.hardware import BusLink, Journal, Link, LockstepLink, MemoryJournal, Progress, Run
+from muxjax.hardware.journal import is_journal
 from muxjax.hardware.links import open_bus
 from muxjax.hardware.log import LoggedLink
 from muxjax.hardware.mapping import MappedLink, Translation
@@ -111,6 +112,8 @@ def run(
     fields = problem_fields(arm, servos, preset, max_step_mm, world)
     begin = start_fields(arm, start_q_deg, after)
     if program is not None:
+        if is_journal(program):
+            raise ValueError(f"{program}: is a journal; muxjax resume goes on with it")
         loaded = load_program(program)
     else:
         if xyz_mm is None:

@@ -229,8 +229,9 @@ def test_an_arm_that_has_moved_is_moved_again(muxjax, tmp_path):
     q = ("30", "0", "20", "90", "10", "180")
     there, back = (str(tmp_path / name) for name in ("there.json", "back.json"))
     muxjax("plan", "--q-deg", *q, "--servos", "1", "3", "--out", there)
-    code, _, _ = muxjax("plan", "--q-deg", *"000000", "--after", there, "--out", back)
+    code, out, _ = muxjax("plan", "--q-deg", *"000000", "--after", there, "--out", back)
     assert code == 0
+    assert "overshoot peak -  -  - %" in out  # relative to no bending
     first, second = load_program(there), load_program(back)
     assert second.start == first.target
     assert second.axial == first.instructions[-1].axial

@@ -11,10 +11,11 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from muxjax.cli import main, runs
+from muxjax.cli import main, plans, runs
 from muxjax.cli.plans import Method
 from muxjax.hardware import Journal
-from muxjax.planning import METHODS
+from muxjax.planning import METHODS, PlanningError
+from muxjax.program_file import load_program
 from muxjax.workspace import load_sweep
 
 
@@ -224,6 +225,72 @@ def test_plan_then_run(muxjax, tmp_path):
     assert "completed" in out
 
 
+def test_an_arm_that_has_moved_is_moved_again(muxjax, tmp_path):
+    q = ("30", "0", "20", "90", "10", "180")
+    there, back = (str(tmp_path / name) for name in ("there.json", "back.json"))
+    muxjax("plan", "--q-deg", *q, "--servos", "1", "3", "--out", there)
+    code, out, _ = muxjax("plan", "--q-deg", *"000000", "--after", there, "--out", back)
+    assert code == 0
+    assert "overshoot peak -  -  - %" in out  # relative to no bending
+    first, second = load_program(there), load_program(back)
+    assert second.start == first.target
+    assert second.axial == first.instructions[-1].axial
+    assert np.abs(second.target).max() < 1e-12
+    code, out, _ = muxjax("run", back, "--json")
+    assert code == 0
+    assert json.loads(out)["largest_error_m"] < 2e-5
+    code, out, _ = muxjax("run", "--q-deg", *"000000", "--after", there, "--json")
+    assert code == 0
+    assert json.loads(out)["largest_error_m"] < 2e-5
+    code, out, _ = muxjax("plan", "--q-deg", *"000000", "--start-q-deg", *q, "--json")
+    assert code == 0
+    program = json.loads(out)["program"]
+    assert program["start"] == pytest.approx(first.target, abs=1e-12)
+    assert program["axial"] is None
+
+
+@pytest.mark.parametrize(
+    ("name", "goal"),
+    [("plan_to_pose", ("--xyz-mm", "0", "0", "420")), ("plan_task", ("--poses", "fig9a"))],
+)
+def test_poses_are_planned_from_where_the_arm_stands(muxjax, tmp_path, monkeypatch, name, goal):
+    there, asked = str(tmp_path / "there.json"), {}
+    muxjax("plan", "--q-deg", "10", "0", "5", "90", "3", "180", "--out", there)
+    first = load_program(there)
+
+    def seen(*_, **fields):
+        asked.update(fields)
+        raise PlanningError("seen")
+
+    monkeypatch.setattr(plans, name, seen)
+    monkeypatch.setattr(runs, name, seen, raising=False)
+    for command in ("plan", "run") if name == "plan_to_pose" else ("plan",):
+        asked.clear()
+        code, _, err = muxjax(command, *goal, "--after", there)
+        assert code == 2
+        assert "seen" in err
+        assert tuple(asked["start"]) == first.target
+        assert asked["axial"] == first.instructions[-1].axial
+
+
+def test_a_start_is_given_once(muxjax, tmp_path):
+    path, straight = str(tmp_path / "program.json"), tuple("000000")
+    muxjax("plan", "--q-deg", "10", "0", "5", "90", "3", "180", "--out", path)
+    both = ("--start-q-deg", *straight, "--after", path)
+    code, _, err = muxjax("plan", "--q-deg", *straight, *both)
+    assert code == 2
+    assert "give only one" in err
+    code, _, err = muxjax("run", path, "--after", path)
+    assert code == 2
+    assert "has its own start" in err
+    code, _, err = muxjax("plan", "--q-deg", *straight, "--start-q-deg", "1", "2")
+    assert code == 2
+    assert "--start-q-deg: muxarm has 3 segments" in err
+    code, _, err = muxjax("plan", "--q-deg", "0", "0", "--after", path, "--robot", "penta")
+    assert code == 2
+    assert "made for robot 'muxarm'" in err
+
+
 def test_a_dry_run_opens_no_bus_and_leaves_journal_and_log(muxjax, tmp_path):
     path, journal, log = (str(tmp_path / name) for name in ("program.json", "j", "log"))
     muxjax("plan", "--q-deg", "10", "0", "5", "90", "3", "180", "--out", path)
@@ -239,6 +306,9 @@ def test_a_dry_run_opens_no_bus_and_leaves_journal_and_log(muxjax, tmp_path):
         assert frames.readline().startswith("(0.000000) can0 020#")
     with Journal.open(journal) as kept:
         assert kept.standing.completed
+    code, out, err = muxjax("run", path, "--log", log)
+    assert (code, out) == (2, "")
+    assert "give another name, or remove the file" in err
 
 
 def test_new_plans_are_made_as_the_command_line_says(muxjax, tmp_path, monkeypatch):

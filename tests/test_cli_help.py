@@ -13,6 +13,7 @@ from rich.table import Table
 
 from muxjax.cli import COMMANDS, GROUPS, leaves, main
 from muxjax.cli.output import complain, make_console, verdict
+from muxjax.config import data_folder
 
 EXAMPLE = re.compile(r"Example: (muxjax .*?)(?:\n\n|\n\s*(?:Args|Raises|Example)|\Z)", re.DOTALL)
 # Commands that print no document: a server, and one whose output is JSON anyway.
@@ -65,6 +66,21 @@ def test_options_are_explained_and_json_is_there(words):
     explained = set(re.findall(r"^        (\w+): \S", call.__doc__ or "", re.MULTILINE))
     assert set(names) <= explained
     assert ("json" in names) == (words not in WITHOUT_JSON)
+
+
+@pytest.mark.parametrize("words", leaves(), ids=" ".join)
+def test_help_that_lists_presets_lists_all_that_ship(words):
+    shipped = {path.stem for path in (data_folder("configs") / "planners").glob("*.yaml")}
+    for line in re.findall(
+        r"^ +preset: (.* or a YAML file)", leaves()[words].__doc__, re.MULTILINE
+    ):
+        assert set(re.findall(r"[a-z-]+(?=,)", line)) == shipped
+
+
+def test_method_and_planner_name_each_other():
+    assert re.search(r"method: .*--planner", leaves()[("plan",)].__doc__)
+    for command in ("run", "resume"):
+        assert re.search(r"planner: .*--method", leaves()[(command,)].__doc__)
 
 
 @pytest.fixture

@@ -15,6 +15,7 @@ from muxjax.hardware.journal import (
     ProgramEntry,
     ServoEntry,
     SessionEntry,
+    is_journal,
 )
 from muxjax.scheduler import Instruction, Program
 
@@ -155,3 +156,17 @@ def test_a_full_disk_leaves_whole_lines(path, monkeypatch):
             journal.write(ENTRIES[3])
         assert path.read_bytes() == data
         assert journal.entries == ENTRIES
+
+
+def test_another_file_is_refused_and_left_as_it_is(tmp_path):
+    for text in ('{"schema": "muxjax/program/1"}', "a note without an end of line", "\n"):
+        (tmp_path / "other").write_text(text)
+        with pytest.raises(ValueError, match=r"other, line 1: not that of a journal"):
+            Journal.open(tmp_path / "other")
+        assert (tmp_path / "other").read_text() == text
+        assert not is_journal(tmp_path / "other")
+
+
+def test_a_journal_is_known_by_its_head(path):
+    assert is_journal(path)
+    assert not is_journal(path.with_name("none"))

@@ -397,3 +397,25 @@ def test_the_npz_of_a_run_is_its_trajectory_at_the_same_times(robot, logged, bot
     _, arrays = both["run"]
     samples = sample(robot, read_log(robot, logged[1]).trajectory, 20.0)
     np.testing.assert_array_equal(samples.displacements, arrays["displacements_m"])
+
+
+def test_a_log_grows_only_while_its_times_do(robot, tmp_path):
+    path, link = tmp_path / "run.log", LockstepLink(robot)
+    hello = [Frame(0x20, bytes(8))]
+    for _ in range(2):  # one clock that goes on
+        with closing(LoggedLink(link, path)) as logged:
+            logged.wait(link.now + 0.02)
+            logged.send(hello)
+    kept = path.read_bytes()
+    assert kept.count(b" T\n") == 2
+    for begin_s in (0.0, 1.7e9):  # the virtual clock anew, then a real one after it
+        with pytest.raises(ValueError, match=r"run\.log exists and ends at 0\.04.*another name"):
+            LoggedLink(LockstepLink(robot), path, begin_s)
+    assert path.read_bytes() == kept
+    real = tmp_path / "real.log"
+    for begin_s in (1.7e9, 1.8e9):  # since 1970
+        with closing(LoggedLink(LockstepLink(robot), real, begin_s)) as logged:
+            logged.send(hello)
+    assert real.read_bytes().count(b" T\n") == 2
+    with pytest.raises(ValueError, match=r"real\.log exists and ends at 1800000000\.0"):
+        LoggedLink(LockstepLink(robot), real)

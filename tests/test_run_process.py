@@ -100,7 +100,7 @@ def test_sigterm_is_an_emergency_stop(lab):
     running = lab.run()
     running.send_signal(signal.SIGTERM)
     out, _ = running.communicate(timeout=20)
-    assert running.returncode == 1
+    assert running.returncode == 130
     assert json.loads(out)["reason"] == "stopped from the keyboard"
     assert json.loads(lab.arm.read_text())["state"] == "ESTOPPED"
     assert lab.truth()[0] < 0.0035

@@ -45,7 +45,7 @@ def demo(
         robot: Shipped robot or path of a YAML file.
         methods: Planners to compare.
         max_step_mm: Greatest tendon displacement in one planning step [mm].
-        preset: Weights of the cost.
+        preset: Weights of the cost: paper, fastest, no-overshoot, gentle, or a YAML file.
         out: Folder for the pictures.
         json: Print JSON in SI units instead of tables.
     """

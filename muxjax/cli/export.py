@@ -8,6 +8,7 @@ from typing import Annotated
 import tyro
 
 from muxjax.cli.output import console, notice, print_json
+from muxjax.hardware.journal import is_journal
 from muxjax.metrics.program import timeline
 from muxjax.program_file import save_program
 from muxjax.recording import (
@@ -65,6 +66,11 @@ def export(
         if out.suffix == ".json":
             raise ValueError(f"--out: a run is no program; {out} must end in .csv, .npz or .mcap")
         document, text = _write_run(arm, source, out, rate_hz, per_segment)
+    elif is_journal(source):
+        raise ValueError(
+            f"{source}: is the journal of a run and has no clock; export takes the run's frames, "
+            "which muxjax run --log FILE.log writes"
+        )
     else:
         document, text = _write_program(arm, read_program(arm, source), out, rate_hz, per_segment)
     if json:

@@ -115,8 +115,10 @@ def _plain(value: Any) -> Any:
 
 
 def row_of(values: Any, scale: float = 1.0, digits: int = 2) -> str:
-    """Scaled numbers side by side, without a minus before zero."""
-    return "  ".join(f"{round(scale * v, digits) + 0.0:.{digits}f}" for v in values)
+    """Scaled numbers side by side, without a minus before zero; "-" for what is not defined."""
+    return "  ".join(
+        "-" if math.isnan(v) else f"{round(scale * v, digits) + 0.0:.{digits}f}" for v in values
+    )
 
 
 def pose_document(pose: Any) -> dict[str, Any]:

@@ -19,9 +19,9 @@ from muxjax.pipeline import PathPlan, PosePlan, plan_task, plan_to_pose
 from muxjax.plan_file import save_plan as write_plan
 from muxjax.planning import Plan, Problem
 from muxjax.planning import plan as plan_steps
-from muxjax.program_file import save_program
+from muxjax.program_file import load_program, save_program
 from muxjax.robot import Robot, load_robot
-from muxjax.scheduler import Program, schedule
+from muxjax.scheduler import Program, check_same_robot, schedule
 from muxjax.tendons import tendon_displacements
 
 Method = Literal[
@@ -35,6 +35,8 @@ def plan(
     quat: Quaternion | None = None,
     q_deg: tuple[float, ...] | None = None,
     poses: str | None = None,
+    start_q_deg: tuple[float, ...] | None = None,
+    after: Path | None = None,
     servos: tuple[int, ...] | None = None,
     method: Method = "exact",
     preset: str = "paper",
@@ -45,11 +47,14 @@ def plan(
     save_plan: Path | None = None,
     json: bool = False,
 ) -> int:
-    """Plan from the straight arm to a pose, to a configuration, or through several poses.
+    """Plan to a pose, to a configuration, or through several poses.
 
-    A pose is reached by the configuration whose plan costs least.
+    A pose is reached by the configuration whose plan costs least. The plan starts from the straight
+    arm, or from where --after or --start-q-deg says that the arm stands.
 
     Example: muxjax plan --q-deg 60 0 75 180 40 0 --servos 1 2 --out program.json
+
+    Example: muxjax plan --q-deg 0 0 0 0 0 0 --after program.json --out back.json
 
     Args:
         xyz_mm: Tool position in the world [mm].
@@ -57,9 +62,11 @@ def plan(
         quat: Orientation as a quaternion w x y z instead.
         q_deg: Bending angle (not negative) and azimuth of each segment [degrees], not a pose.
         poses: Shipped task or path of a YAML file, whose targets are passed in order, instead.
+        start_q_deg: Start from this configuration [degrees] instead of the straight arm.
+        after: Start where this program ends instead; its last axial position is then known, too.
         servos: Available servos; all by default.
-        method: Planner.
-        preset: Weights of the cost: paper, fastest, no-overshoot, or a YAML file.
+        method: Planner; muxjax run and resume call it --planner.
+        preset: Weights of the cost: paper, fastest, no-overshoot, gentle, or a YAML file.
         max_step_mm: Greatest tendon displacement in one step [mm]; no limit by default.
         world: Shipped world or path of a YAML file, of which every step must be clear.
         robot: Shipped robot or path of a YAML file.
@@ -75,14 +82,17 @@ def plan(
         raise ValueError("plan: only --xyz-mm takes --rpy-deg or --quat")
     if poses is not None and save_plan is not None:
         raise ValueError("plan: --save-plan takes one plan, --poses makes several; use --out")
+    begin = start_fields(arm, start_q_deg, after)
     if poses is not None:
         task = load_yaml(TaskConfig, resolve(poses, "tasks"))
-        return _report_path(arm, task, plan_task(arm, task, method=method, **fields), out, json)
+        path = plan_task(arm, task, method=method, **begin, **fields)
+        return _report_path(arm, task, path, out, json)
     choice = None
     if xyz_mm is None:
-        found = plan_to_configuration(arm, q_deg, method, fields)
+        found = plan_to_configuration(arm, q_deg, method, begin | fields)
     else:
-        choice = plan_to_pose(arm, pose_argument(xyz_mm, rpy_deg, quat), method=method, **fields)
+        pose = pose_argument(xyz_mm, rpy_deg, quat)
+        choice = plan_to_pose(arm, pose, method=method, **begin, **fields)
         found = choice.plan
     if save_plan is not None:
         write_plan(found, save_plan)
@@ -92,11 +102,35 @@ def plan(
 def plan_to_configuration(
     arm: Robot, q_deg: tuple[float, ...] | None, method: Method, fields: dict[str, Any]
 ) -> Plan:
-    """Plan from the straight arm to a configuration [degrees]."""
+    """Plan to a configuration [degrees]; the fields of ``Problem`` have the start."""
     assert q_deg is not None  # the callers have seen to it
     q = configuration_argument(arm, "--q-deg", q_deg)
-    problem = Problem(np.zeros(arm.n_tendons), tendon_displacements(arm, q), **fields)
+    problem = Problem(target=tendon_displacements(arm, q), **fields)
     return plan_steps(arm, problem, method)
+
+
+def start_fields(
+    arm: Robot, start_q_deg: tuple[float, ...] | None, after: Path | None
+) -> dict[str, Any]:
+    """Fields of ``Problem`` that say where the arm stands: straight unless something is given.
+
+    Raises:
+        ValueError: Both are given, a configuration that the arm does not have, or the program of
+            another robot.
+        ConfigError: The program cannot be read.
+    """
+    if start_q_deg is not None and after is not None:
+        raise ValueError("--start-q-deg, --after: the arm starts from one of them; give only one")
+    if start_q_deg is not None:
+        q = configuration_argument(arm, "--start-q-deg", start_q_deg)
+        return {"start": np.asarray(tendon_displacements(arm, q)), "axial": None}
+    if after is None:
+        return {"start": np.zeros(arm.n_tendons), "axial": None}
+    before = load_program(after)
+    check_same_robot(arm, before)
+    visits = before.instructions
+    axial = visits[-1].axial if visits else before.axial
+    return {"start": np.array(before.target), "axial": axial}
 
 
 def problem_fields(

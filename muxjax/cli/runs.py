@@ -15,10 +15,11 @@ import tyro
 from rich.table import Table
 
 from muxjax.cli.output import console, notice, print_json, verdict
-from muxjax.cli.plans import Method, plan_to_configuration, problem_fields
+from muxjax.cli.plans import Method, plan_to_configuration, problem_fields, start_fields
 from muxjax.cli.poses import Quaternion, Xyz, pose_argument
 from muxjax.cli.progress import Reporter
 from muxjax.hardware import BusLink, Journal, Link, LockstepLink, MemoryJournal, Progress, Run
+from muxjax.hardware.journal import is_journal
 from muxjax.hardware.links import open_bus
 from muxjax.hardware.log import LoggedLink
 from muxjax.hardware.mapping import MappedLink, Translation
@@ -27,6 +28,11 @@ from muxjax.program_file import load_program
 from muxjax.robot import Robot, load_robot
 from muxjax.scheduler import Program, check_same_robot, schedule
 
+_POWER_UP = (
+    "ESTOP holds until the board's power-up: switch it off and on (end and restart muxjax board); "
+    "then "
+)
+
 
 def run(
     program: Annotated[Path | None, tyro.conf.Positional] = None,
@@ -34,6 +40,8 @@ def run(
     rpy_deg: Xyz | None = None,
     quat: Quaternion | None = None,
     q_deg: tuple[float, ...] | None = None,
+    start_q_deg: tuple[float, ...] | None = None,
+    after: Path | None = None,
     servos: tuple[int, ...] | None = None,
     planner: Method = "exact",
     preset: str = "paper",
@@ -61,15 +69,19 @@ def run(
 
     Example: muxjax run program.json --bus lab --journal arm.journal
 
+    Example: muxjax run --q-deg 0 0 0 0 0 0 --after program.json --bus lab
+
     Args:
         program: File written by muxjax plan --out.
         xyz_mm: Instead of a program: tool position in the world [mm].
         rpy_deg: Roll, pitch, yaw [degrees]; upright by default.
         quat: Orientation as a quaternion w x y z instead.
         q_deg: Bending angle (not negative) and azimuth of each segment [degrees], not a pose.
+        start_q_deg: Where the arm stands, for the plan [degrees]; straight by default.
+        after: The program after which the plan starts, instead; not the one to run.
         servos: Available servos, for the plan; all by default.
-        planner: Method of the plan, and of new ones.
-        preset: Weights of their cost: paper, fastest, no-overshoot, or a YAML file.
+        planner: Method of the plan, and of new ones; muxjax plan calls it --method.
+        preset: Weights of their cost: paper, fastest, no-overshoot, gentle, or a YAML file.
         max_step_mm: Greatest tendon displacement in one of their steps [mm]; no limit by default.
         world: Shipped world or path of a YAML file, of which every step they make must be clear.
         robot: Shipped robot or path of a YAML file; a program runs only on its own robot.
@@ -79,7 +91,8 @@ def run(
         rehearse: The virtual board first, before --bus is opened.
         physics: Of the virtual board: ideal, realistic, harsh, or a YAML file.
         journal: File for muxjax resume; on a bus run.journal by default.
-        log: File for every frame of the run, as candump -L writes it.
+        log: File for every frame of the run, as candump -L writes it. On a bus it grows if it
+            exists; the virtual board, whose clock begins at 0, needs a new one.
         stream_divider: Feedback at 1 / this of its rates, for slow serial links.
         mapping: YAML file of a lab's own DBC that the board on --bus speaks.
         json: Print JSON in SI units.
@@ -90,16 +103,24 @@ def run(
         raise ValueError("run: only --xyz-mm takes --rpy-deg or --quat")
     if mapping is not None and bus is None:
         raise ValueError("run: --mapping is of the board on --bus")
+    if program is not None and not (start_q_deg is None and after is None):
+        raise ValueError(
+            f"run: {program} has its own start; --start-q-deg and --after are for a plan to "
+            "--xyz-mm or --q-deg"
+        )
     arm = load_robot(robot)
     fields = problem_fields(arm, servos, preset, max_step_mm, world)
+    begin = start_fields(arm, start_q_deg, after)
     if program is not None:
+        if is_journal(program):
+            raise ValueError(f"{program}: is a journal; muxjax resume goes on with it")
         loaded = load_program(program)
     else:
         if xyz_mm is None:
-            found = plan_to_configuration(arm, q_deg, planner, fields)
+            found = plan_to_configuration(arm, q_deg, planner, begin | fields)
         else:
             pose = pose_argument(xyz_mm, rpy_deg, quat)
-            found = plan_to_pose(arm, pose, method=planner, **fields).plan
+            found = plan_to_pose(arm, pose, method=planner, **begin, **fields).plan
         loaded = schedule(arm, found)
     check_same_robot(arm, loaded)
     translation = None if mapping is None else Translation(mapping)
@@ -116,6 +137,8 @@ def run(
                 done = go_logged(virtual, log, 0.0, lambda link: go(link, into, tell))
             return report(done, loaded, json)
         done = go(virtual, MemoryJournal(), None)
+        if done.interrupted:
+            raise KeyboardInterrupt
         if not done.completed:
             raise ValueError(f"run: the rehearsal on the virtual board failed: {done.reason}")
         notice(f"rehearsed on the virtual board: {done.duration_s:.2f} s")
@@ -151,8 +174,8 @@ def resume(
         journal: File that muxjax run has written.
         bus: As for muxjax run.
         robot: Shipped robot or path of a YAML file.
-        planner: Method of new plans.
-        preset: Weights of their cost: paper, fastest, no-overshoot, or a YAML file.
+        planner: Method of new plans; muxjax plan calls it --method.
+        preset: Weights of their cost: paper, fastest, no-overshoot, gentle, or a YAML file.
         max_step_mm: Greatest tendon displacement in one of their steps [mm]; no limit by default.
         world: Shipped world or path of a YAML file, of which every step of theirs must be clear.
         log: File for every frame, as candump -L writes it; it grows if it exists.
@@ -219,6 +242,7 @@ def go_logged(link: Link, log: Path | None, begin_s: float, go: Callable[[Link],
 def report(done: Run, program: Program, json: bool, journal: Path | None = None) -> int:
     """Print how a run went; its exit code."""
     error = np.abs(done.measured - np.array(program.target))
+    code = 0 if done.completed else 130 if done.interrupted else 1
     if json:
         print_json(
             {
@@ -226,6 +250,7 @@ def report(done: Run, program: Program, json: bool, journal: Path | None = None)
                 "completed": done.completed,
                 "reason": done.reason,
                 "resumable": done.resumable,
+                "estopped": done.estopped,
                 "failed_servos": done.failed_servos,
                 "duration_s": done.duration_s,
                 "measured_m": done.measured,
@@ -234,19 +259,26 @@ def report(done: Run, program: Program, json: bool, journal: Path | None = None)
                 "preflight": [dataclasses.asdict(check) for check in done.checks],
             }
         )
-        return 0 if done.completed else 1
-    table = Table("stage", "axial", "begin [s]", "end [s]", "trims")
-    for number, r in enumerate(done.records, start=1):
-        table.add_row(str(number), str(r.axial), f"{r.start_s:.2f}", f"{r.end_s:.2f}", str(r.trims))
-    console.print(table)
-    console.print(
-        verdict(done.reason, done.completed)
-        + f": {done.duration_s:.2f} s on the board's clock, wheels within "
-        f"{1e3 * np.max(error):.3f} mm of the target"
-    )
+        return code
+    if done.records:
+        table = Table("instruction", "axial", "begin [s]", "end [s]", "trims")
+        for r in done.records:
+            times = f"{r.start_s:.2f}", f"{r.end_s:.2f}"
+            table.add_row(str(r.number), str(r.axial), *times, str(r.trims))
+        console.print(table)
+    if np.isnan(done.duration_s):
+        how = "the board did not arm"
+    elif done.completed and not done.records:
+        how = "nothing was left to do"
+    else:
+        how = f"{done.duration_s:.2f} s on the board's clock"
+    if np.isfinite(error).all():
+        how += f", wheels within {1e3 * np.max(error):.3f} mm of the target"
+    console.print(verdict(done.reason, done.completed) + f": {how}")
     if done.failed_servos:
         console.print(f"failed servos: {' '.join(map(str, done.failed_servos))}")
     if journal is not None and not done.completed:
         what = "goes on" if done.resumable else "goes on once the part is repaired"
-        console.print(f"muxjax resume {journal} --bus ... {what}")
-    return 0 if done.completed else 1
+        first = _POWER_UP if done.estopped else ""
+        console.print(f"{first}muxjax resume {journal} --bus ... {what}", soft_wrap=True)
+    return code

@@ -42,7 +42,7 @@ def task(
         mission: Shipped mission (cabinet, pipe) or path of a YAML file.
         servos: Available servos; all by default.
         robot: Shipped robot or path of a YAML file.
-        preset: Weights of the planner's cost.
+        preset: Weights of the planner's cost: paper, fastest, no-overshoot, gentle, or a YAML file.
         physics: Physics of the virtual board.
         seed: Of the in-between shapes, where direct plans are blocked.
         out: Folder for the pictures.

@@ -69,7 +69,7 @@ def view(
         servos: Available servos; the others are marked as failed. All by default.
         method: Planner chosen first.
         beside: Planner whose plan is shown beside it.
-        preset: Weights of the planners' cost: paper, fastest, no-overshoot, or a YAML file.
+        preset: Weights of the planners' cost: paper, fastest, no-overshoot, gentle, or a YAML file.
         world: Shipped world or path of a YAML file, drawn, of which plans must be clear.
         sweep: Result of muxjax sweep (.npz), drawn as a cloud shaded by dexterity.
         cloud: Draw the workspace as a cloud of random samples instead.

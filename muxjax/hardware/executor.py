@@ -71,6 +71,8 @@ class Run:
         failed_servos: Servos not to be used again, from 1; ``muxjax.pipeline.run_to_target``
             goes on without them.
         checks: The preflight report.
+        interrupted: The host has stopped it by ESTOP, for a keyboard interrupt.
+        estopped: The board is, or may be, stopped by ESTOP, and takes nobody until its power-up.
     """
 
     completed: bool
@@ -82,6 +84,8 @@ class Run:
     resumable: bool = False
     failed_servos: tuple[int, ...] = ()
     checks: tuple[Check, ...] = ()
+    interrupted: bool = False
+    estopped: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -217,6 +221,7 @@ class Executor(Transaction):
         self._done, self._leg = before.done, before.leg
         self._reason = ""
         self._refused = self._completed = self._resumable = False
+        self._interrupted = self._estopped = False
         self._guarded = False  # whether losing the board, or its armed state, ends the session
         self._first_armed_at: float | None = None  # on the link's clock
         self._duration = 0.0  # of the sessions that are over, while armed
@@ -286,6 +291,7 @@ class Executor(Transaction):
 
     def estop(self, reason: str) -> None:
         """Stop everything now; the board latches it until its power-up."""
+        self._interrupted = self._estopped = True
         self._script.close()
         self._script, self._script_due = self._stop_board(reason), -math.inf
 
@@ -324,6 +330,8 @@ class Executor(Transaction):
             resumable=self._resumable,
             failed_servos=self.journal.standing.failed_servos,
             checks=self.checks,
+            interrupted=self._interrupted,
+            estopped=self._estopped,
         )
 
     # The script
@@ -350,6 +358,8 @@ class Executor(Transaction):
                 self._refused = isinstance(failure, Wrong) and self._first_armed_at is None
                 lasting = failure.reason is Reason.WHEEL_STILL  # the clutch slips every time
                 self._resumable = failure.after is not After.REPAIR and not lasting
+                said_so = self.sensors.state is BoardState.ESTOPPED
+                self._estopped = said_so or failure.reason is Reason.ESTOPPED
                 break
             left -= 1
             self.phase = "before a new session"
@@ -394,7 +404,7 @@ class Executor(Transaction):
             self._leg = self.journal.standing.leg
         self._done = number
         end = self._duration + self._armed_s
-        self.records.append(InstructionRecord(visit.axial, start, end, trims))
+        self.records.append(InstructionRecord(number, visit.axial, start, end, trims))
 
     def _mend(self) -> Script[None]:
         """Visit again what a clutch moved on its way out, where the wheels saw it."""

@@ -206,6 +206,7 @@ class Handshake(Session):
     def _preflight(self, expected: Standing) -> tuple[Check, ...]:
         sensors, robot = self.sensors, self.robot
         servos, bad = self._needed_servos(expected), self._silent_servos(expected)
+        asked = f"{servos} needed, they answer" if servos else "none needed, nothing is left to do"
         inl_mm = 1e3 * math.radians(robot.config.encoder.inl_deg.value) * float(robot.wheel_radius)
         return (
             Check("protocol version", True, f"{VERSION}"),
@@ -215,7 +216,7 @@ class Handshake(Session):
             Check(
                 "servos",
                 not bad,
-                f"{bad} stalled or offline" if bad else f"{servos} needed, they answer",
+                f"{bad} stalled or offline" if bad else asked,
             ),
             Check("wheel encoders", True, f"{robot.n_tendons} answer"),
             Check(
@@ -259,7 +260,13 @@ class Handshake(Session):
 
     def _refuse(self, check: Check, expected: Standing) -> None:
         text = f"{check.name}: {check.detail}"
-        if check.name in ("program.start", "lengths"):
+        if check.name == "program.start":
+            raise Wrong(
+                f"{text}; plan from where the arm stands: muxjax plan --after PROGRAM or "
+                "--start-q-deg, in Python Problem(start, ...). A virtual board made in Python "
+                "stands straight unless LockstepLink(robot, displacements=program.start) says so"
+            )
+        if check.name == "lengths":
             raise Wrong(text)
         if check.name == "servos":
             raise Failed(text, After.REPAIR, servo=self._silent_servos(expected)[0])

@@ -10,6 +10,7 @@ written ahead of a motion are on the disk before the motion's first frame leaves
 from __future__ import annotations
 
 import os
+import re
 import zlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -23,6 +24,7 @@ from muxjax.config import Strict, explain
 from muxjax.scheduler import Program
 
 Lengths = tuple[float | None, ...]  # by the wheels [m]; None for a wheel never heard
+_HEAD = re.compile(rb"[0-9a-f]{0,8}|[0-9a-f]{8} ")  # the first 9 bytes, also where they are torn
 
 
 class ProgramEntry(Strict):
@@ -285,8 +287,23 @@ def read_entries(path: str | Path) -> list[Entry]:
     return _entries(path, path.read_bytes())[0]
 
 
+def is_journal(path: str | Path) -> bool:
+    """Whether a file begins as a journal does; False if there is no such file."""
+    path = Path(path)
+    if not path.is_file():
+        return False
+    with path.open("rb") as file:
+        head = file.read(9)
+    return len(head) == 9 and _HEAD.fullmatch(head) is not None
+
+
 def _entries(path: Path, data: bytes) -> tuple[list[Entry], int]:
     """Entries of the whole lines, and how many bytes those are."""
+    if not _HEAD.fullmatch(data[:9]):  # before anything is taken for torn, and cut off
+        what = "not that of a journal, as muxjax run --journal writes it"
+        if b'"muxjax/program/' in data[:200]:
+            what += "; this is a program, which muxjax run takes"
+        raise ValueError(f"{path}, line 1: {what}")
     whole = data.rfind(b"\n") + 1
     lines = data[:whole].splitlines()
     entries = [_parse(path, n, line) for n, line in enumerate(lines, start=1)]

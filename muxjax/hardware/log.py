@@ -3,12 +3,17 @@
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Iterable
 from pathlib import Path
 
 from muxjax.hardware.links import Link
 from muxjax.hardware.protocol import Frame
 from muxjax.scheduler import Trajectory
+
+_STAMP = re.compile(rb"^\((\d+\.\d+)\) ", re.MULTILINE)
+_TAIL = 1 << 12  # bytes at the end of a file in which its last stamp stands
+_CALENDAR_S = 1e9  # times since 1970 are beyond this, those of a virtual clock are not
 
 
 class LoggedLink:
@@ -19,15 +24,21 @@ class LoggedLink:
 
     Args:
         link: The link.
-        path: Of the file, which grows if it exists.
+        path: Of the file, which grows if it exists and its times go on without falling.
         begin_s: Time in the file at the zero of the link's clock [s]; for a link in real time,
             ``time.time() - link.now``.
+
+    Raises:
+        ValueError: The file's last time is later than the link's now, or one of the two is of a
+            virtual clock, which begins at 0, and the other since 1970.
+        OSError: The file cannot be read or written.
     """
 
     def __init__(self, link: Link, path: str | Path, begin_s: float = 0.0) -> None:
         self.robot = link.robot
         self.stream_divider = link.stream_divider
         self._link, self._begin = link, begin_s
+        _check_goes_on(Path(path), begin_s + link.now)
         self._file = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o644)
 
     @property
@@ -64,3 +75,20 @@ class LoggedLink:
         lines = (f"({at:.6f}) can0 {f.id:03X}#{f.data.hex().upper()} {way}\n" for f in frames)
         if text := "".join(lines):
             os.write(self._file, text.encode())
+
+
+def _check_goes_on(path: Path, now: float) -> None:
+    """Raise ValueError unless frames of this time [s] may follow those in the file."""
+    if not path.is_file():
+        return
+    with path.open("rb") as file:
+        file.seek(max(0, path.stat().st_size - _TAIL))
+        stamps = _STAMP.findall(file.read())
+    if not stamps:
+        return
+    last = float(stamps[-1])
+    if last > now or (last < _CALENDAR_S < now):
+        raise ValueError(
+            f"log: {path} exists and ends at {last:.6f} s, this run begins at {now:.6f} s (a "
+            "virtual board's clock begins at 0); give another name, or remove the file"
+        )

@@ -25,8 +25,12 @@ FOLLOW_SHARE = 0.05  # of the way
 
 @dataclass(frozen=True)
 class InstructionRecord:
-    """What one instruction did. Times count from arming, on the board's clock [s]."""
+    """What one instruction did. Times count from arming, on the board's clock [s].
 
+    ``number`` is the instruction's in its program, from 1.
+    """
+
+    number: int
     axial: int
     start_s: float
     end_s: float

@@ -103,7 +103,7 @@ def run_to_target(
         run = resume(journal, link, on_progress=on_progress)
     else:
         run = execute(program, link, journal=journal, on_progress=on_progress)
-    while not run.completed:
+    while not (run.completed or run.interrupted):
         program = _without_failed(link.robot, journal, method, fields)
         if program is None:
             break

@@ -119,6 +119,7 @@ def test_the_jacobian_agrees_with_finite_differences(setting, rng):
         np.testing.assert_allclose(exact @ way, slope, atol=1e-5 * abs(slope).max())
 
 
+@pytest.mark.slow
 def test_exact_data_give_the_truth_back(setting, tmp_path):
     """Without noise everything comes back, and the file of the fit holds it."""
     small, chain, _, parameters, theta, truth = setting

@@ -119,6 +119,7 @@ def profiled(muxarm, chain, goal):
     return program, tension_along(muxarm, chain, [program], samples_a_leg=3)[0]
 
 
+@pytest.mark.slow
 def test_a_program_ends_in_the_equilibrium_of_its_target(chain, goal, profiled):
     _, profile = profiled
     assert profile.unsolved == 0
@@ -185,6 +186,7 @@ def loops(chain):
     return {mu: winding_loop(chain, 1, depth=0.03, friction=mu, steps=8) for mu in (0.0, 0.15)}
 
 
+@pytest.mark.slow
 def test_without_friction_the_path_is_the_frictionless_one(chain, loops):
     free = loops[0.0]
     assert free.converged.all()

@@ -419,3 +419,11 @@ def test_a_log_grows_only_while_its_times_do(robot, tmp_path):
     assert real.read_bytes().count(b" T\n") == 2
     with pytest.raises(ValueError, match=r"real\.log exists and ends at 1800000000\.0"):
         LoggedLink(LockstepLink(robot), real)
+
+
+def test_a_log_goes_on_behind_its_last_whole_line(robot, tmp_path):
+    path = tmp_path / "run.log"
+    whole = "(1800000000.000000) can0 050#00 R\n"
+    path.write_text(whole + "(1800000001.0000")
+    with closing(LoggedLink(LockstepLink(robot), path, begin_s=1.8e9 + 2)):
+        assert path.read_text() == whole

@@ -24,7 +24,8 @@ class LoggedLink:
 
     Args:
         link: The link.
-        path: Of the file, which grows if it exists and its times go on without falling.
+        path: Of the file, which grows if it exists and its times go on without falling; a last
+            line that is not whole goes.
         begin_s: Time in the file at the zero of the link's clock [s]; for a link in real time,
             ``time.time() - link.now``.
 
@@ -38,7 +39,7 @@ class LoggedLink:
         self.robot = link.robot
         self.stream_divider = link.stream_divider
         self._link, self._begin = link, begin_s
-        _check_goes_on(Path(path), begin_s + link.now)
+        _make_ready(Path(path), begin_s + link.now)
         self._file = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o644)
 
     @property
@@ -77,13 +78,19 @@ class LoggedLink:
             os.write(self._file, text.encode())
 
 
-def _check_goes_on(path: Path, now: float) -> None:
-    """Raise ValueError unless frames of this time [s] may follow those in the file."""
+def _make_ready(path: Path, now: float) -> None:
+    """Make a file end with a whole line; a failed supply may have cut its last one.
+
+    Raises:
+        ValueError: Frames of this time [s] cannot follow those in the file.
+    """
     if not path.is_file():
         return
+    size = path.stat().st_size
     with path.open("rb") as file:
-        file.seek(max(0, path.stat().st_size - _TAIL))
-        stamps = _STAMP.findall(file.read())
+        file.seek(max(0, size - _TAIL))
+        tail = file.read()
+    stamps = _STAMP.findall(tail)
     if not stamps:
         return
     last = float(stamps[-1])
@@ -92,3 +99,4 @@ def _check_goes_on(path: Path, now: float) -> None:
             f"log: {path} exists and ends at {last:.6f} s, this run begins at {now:.6f} s (a "
             "virtual board's clock begins at 0); give another name, or remove the file"
         )
+    os.truncate(path, size - len(tail) + tail.rfind(b"\n") + 1)

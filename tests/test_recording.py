@@ -16,7 +16,7 @@ from muxjax.cli import main
 from muxjax.config import ConfigError
 from muxjax.hardware import LockstepLink
 from muxjax.hardware.log import LoggedLink
-from muxjax.hardware.protocol import BoardState, Fault, Port
+from muxjax.hardware.protocol import BoardState, Fault, Frame, Port
 from muxjax.metrics.program import timeline
 from muxjax.program_file import save_program
 from muxjax.recording import (

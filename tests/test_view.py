@@ -18,7 +18,14 @@ from muxjax.cli import main
 from muxjax.collision import load_world
 from muxjax.hardware import Journal, LockstepLink
 from muxjax.hardware.faults import FaultConfig
-from muxjax.hardware.journal import DoneEntry, Entry, LegEntry, ProgramEntry, ServoEntry
+from muxjax.hardware.journal import (
+    DoneEntry,
+    Entry,
+    LegEntry,
+    ProgramEntry,
+    ServoEntry,
+    SessionEntry,
+)
 from muxjax.hardware.log import LoggedLink
 from muxjax.metrics.program import timeline
 from muxjax.pipeline import run_to_target
@@ -349,6 +356,22 @@ def test_a_journals_times_are_those_of_eq_14(arm, program):
         predicted = track_of_program(arm, chosen, "mine")
         for time_s in line.time_s:
             assert track.at(time_s).axial == pytest.approx(predicted.at(time_s).axial)
+
+
+def test_the_next_run_of_a_journal_begins_elsewhere_at_once(arm, program):
+    once = entries_of(arm, program)
+    one = track_of_journal(arm, once, "one")
+    ends, starts = np.array(program.target), np.array(program.start)
+    measured = SessionEntry(session=2, boot_count=1, lengths=tuple(starts))
+    for second in (once, [measured, *once[1:]]):  # a new program; the same one on a new board
+        two = track_of_journal(arm, [*once, *second], "two")
+        assert two.duration_s == pytest.approx(2 * one.duration_s, abs=0.01)
+        before, after = two.at(one.duration_s - 1e-9), two.at(one.duration_s)
+        np.testing.assert_allclose(before.displacements, ends, atol=1e-3)
+        np.testing.assert_allclose(after.displacements, starts, atol=1e-9)
+        assert not after.moving.any()
+        assert any("its start is elsewhere" in mark.phase for mark in two.marks)
+        np.testing.assert_allclose(two.at(two.duration_s).displacements, ends, atol=1e-3)
 
 
 def test_servos_that_a_program_left_out_are_back_in_the_next_one(arm, program):

@@ -254,6 +254,7 @@ def test_a_programs_track_is_its_timeline_and_ends_at_the_target(arm, program):
         assert set(np.flatnonzero(moment.moving) + 1) <= set(item.clutches)
         assert moment.moving.any()
     assert track.marks[0].lost.tolist() == [False, True, False]
+    assert {track.at(time_s).left_out for time_s in line.time_s} == {(2,)}
 
 
 def test_a_turning_drum_is_between_its_positions(arm, program):
@@ -382,6 +383,9 @@ def test_servos_that_a_program_left_out_are_back_in_the_next_one(arm, program):
         [*entries, later],
         [*entries, ServoEntry(servo=3, reason="stalled"), later],
     )]  # fmt: skip
+    entry = track_of_journal(arm, [*entries, ServoEntry(servo=3, reason="stalled")], "mine")
+    assert [m.left_out for m in (entry.marks[0], entry.marks[-1])] == [(2,), (2,)]
+    assert entry.marks[-1].lost.tolist() == [False, True, True]
     assert lost == [[False, True, False], [False] * 3, [False, False, True]]
 
 

@@ -28,6 +28,7 @@ from muxjax.viz.playback import (
     axial_before,
     lost_servos,
     move_words,
+    numbers_of,
     track_of_program,
 )
 
@@ -136,7 +137,8 @@ def track_of_journal(robot: Robot, entries: list[Entry], name: str) -> Track:
                 times.append(time_s)
                 points.append(now)
                 what = f"drum turns to {slot + 1}" if turns else "clutches engage"
-                marks.append(Marks(time_s, none, lost, f"{stage}: {what}"))
+                out = numbers_of(lost & ~failed)
+                marks.append(Marks(time_s, none, lost, f"{stage}: {what}", out))
                 time_s += float(robot.switch_time if turns else robot.engage_time)
                 axial = float(slot)
                 axial_s.append(time_s - float(robot.engage_time))
@@ -153,7 +155,7 @@ def track_of_journal(robot: Robot, entries: list[Entry], name: str) -> Track:
             engaged, phase = none, f"{phase}; its start is elsewhere"
         times.append(time_s)
         points.append(now)
-        marks.append(Marks(time_s, engaged, lost, phase))
+        marks.append(Marks(time_s, engaged, lost, phase, numbers_of(lost & ~failed)))
     assert program is not None  # a journal begins with a program
     return Track(
         name,

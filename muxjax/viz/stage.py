@@ -193,10 +193,11 @@ class Stage:
         for s, (box, label) in enumerate(zip(self._servos, self._names, strict=True)):
             place = drum.servo_place(robot, s, 0.0 if axial is None else axial)
             box.position, box.wxyz = place.frame[:3, 3], quaternion(place.frame[:3, :3])
-            failed = bool(moment.lost[s])
+            lost = bool(moment.lost[s])
             turns = bool(moment.slot) and bool(moment.moving[drum.facing(robot, moment.slot)[s]])
-            box.color = (115, 115, 115) if failed else ((200, 70, 0) if turns else (70, 70, 70))
-            state = ": out of use" if failed else (" turns" if turns else "")
+            box.color = (115, 115, 115) if lost else ((200, 70, 0) if turns else (70, 70, 70))
+            why = ": not in the program" if s + 1 in moment.left_out else ": failed"
+            state = why if lost else (" turns" if turns else "")
             label.text = f"servo {s + 1}{state}"
             # Above the drum, on a mast, no name is hidden by it.
             label.position = place.frame[:3, 3] * [1, 1, 0] + (self._top + 0.002) * _UP

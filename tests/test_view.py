@@ -48,6 +48,7 @@ from muxjax.viz.screenshot import (
     press,
     settle,
 )
+from muxjax.viz.surroundings import view_of
 from muxjax.viz.viewer import Viewer
 from tests.conftest import random_configurations
 
@@ -210,6 +211,25 @@ def test_surfaces_lie_where_the_collision_model_has_them(arm, name, kinds):
         line, bore = np.asarray(world.tube_line[0]), float(world.tube_bore[0])
         ring = found[0].vertices[:32]
         np.testing.assert_allclose(np.linalg.norm(ring - line[0], axis=1), bore)
+
+
+@pytest.mark.parametrize("beside", [0.0, 0.6])
+@pytest.mark.parametrize("tall", [0.4, 1.0])
+def test_the_view_holds_every_point_beside_the_panel(rng, beside, tall):
+    points = rng.uniform([-0.4, -0.3, 0.0], [0.2 + beside, 0.2, tall], (200, 3))
+    place, onward = view_of(points)
+    right = np.cross(onward, [0.0, 0.0, 1.0])
+    right /= np.linalg.norm(right)
+    away = points - place
+    half = (away @ onward) * np.tan(np.radians(45) / 2)  # of the page's height, there
+    assert (half > 0).all()
+    across, up = away @ right / half, away @ np.cross(right, onward) / half
+    assert np.abs(up).max() <= 0.96 + 1e-9
+    assert across.min() >= -1.55 * 0.96 - 1e-9
+    assert across.max() <= 1.55 * 0.38 + 1e-9
+    # And it is no further away than it must be.
+    tight = np.ptp(np.r_[up.min(), up.max()]) > 1.8, across.max() - across.min() > 1.9
+    assert any(tight)
 
 
 def test_a_sampled_cloud_lies_within_reach(arm):
@@ -768,6 +788,22 @@ def test_bad_input_is_code_2(arguments, why, capsys, monkeypatch, tmp_path):
         main(["view", *arguments])
     assert stop.value.code == 2
     assert why in capsys.readouterr().err
+
+
+def test_a_time_after_the_timelines_end_is_said(arm, program, capsys, monkeypatch, tmp_path):
+    def interrupted(self):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(Viewer, "run", interrupted)
+    path = tmp_path / "program.json"
+    save_program(program, path)
+    ends = track_of_program(arm, program, "").duration_s
+    for at_s, said in ((500, True), (1, False)):
+        with pytest.raises(SystemExit) as end:
+            main(["view", str(path), "--at-s", str(at_s), "--port", "0"])
+        assert end.value.code == 0
+        found = f"--at-s {at_s}: the timeline ends at {ends:.2f} s" in capsys.readouterr().err
+        assert found == said
 
 
 def test_a_missing_browser_is_said(monkeypatch):

@@ -288,7 +288,9 @@ def draw_statics(chain: str, displacements_mm: Sequence[float], payload_kg: floa
         for mounting, one in found.items()
     }
     header = ("mounting", "tip x, y, z [mm]", "largest tension [N]", "")
-    return Drawn(mountings_figure(arm, found, GRAVITY), header, rows, {"chain": arm.name} | document)
+    return Drawn(
+        mountings_figure(arm, found, GRAVITY), header, rows, {"chain": arm.name} | document
+    )
 
 
 def draw_training(runs: Sequence[Path]) -> Drawn:

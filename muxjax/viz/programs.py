@@ -160,7 +160,9 @@ def _add_legend(figure: Figure, robot: Robot) -> None:
     ]
     motion = mpl.patches.Patch(color="0.5", alpha=0.15, lw=0)
     above = [(line, f"segment {i}") for i, line in enumerate(segments, start=1)]
-    below = [(line, f"tendon {j} of the segment") for j, line in enumerate(tendons, start=1)]
+    below: list[tuple[Any, str]] = [
+        (line, f"tendon {j} of the segment") for j, line in enumerate(tendons, start=1)
+    ]
     below.append((motion, "motion"))
     names = [*above, *below]
     if len(names) > _NAMES_A_ROW:

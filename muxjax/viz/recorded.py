@@ -32,7 +32,6 @@ from muxjax.viz.playback import (
     track_of_program,
 )
 
-
 _ELSEWHERE = 5e-4  # least difference of a beginning from the end before it; less is slip [m]
 
 

@@ -95,9 +95,7 @@ def mountings_figure(
             _draw_weight(axes, gravity[name])
             gap = np.linalg.norm(lines["statics"][-1] - lines["constant curvature"][-1])
             state = "" if found[name].converged else ", NO EQUILIBRIUM"
-            axes.set_title(
-                f"{name}\nconstant curvature is {gap:.0f} mm off\nat the tip{state}"
-            )
+            axes.set_title(f"{name}\nconstant curvature is {gap:.0f} mm off\nat the tip{state}")
         _same_scale(grid[0], everything, across=[0] * len(found))
         largest = max(float(np.max(one.tension)) for one in found.values())
         for axes, one in zip(grid[1], found.values(), strict=True):

@@ -366,6 +366,7 @@ def test_a_bus_that_cannot_be_opened_comes_after_the_rehearsal(muxjax, tmp_path,
         (["run", "nothing.json", "--mapping", "m.yaml"], "--mapping is of the board on --bus"),
         (["run", "nothing.json", "--world", "nothing"], "no 'nothing' among the shipped files"),
         (["demo", "--task", "nothing"], "no 'nothing' among the shipped files"),
+        (["demo", "--robot", "penta"], "--task: 'fig9a' is for a robot of 3 segments"),
     ],
 )
 def test_bad_input_is_an_error_of_one_line(muxjax, arguments, message):

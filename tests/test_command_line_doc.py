@@ -8,8 +8,10 @@ import subprocess
 from pathlib import Path
 
 import pytest
+import yaml
 
 from muxjax.cli import COMMANDS, main
+from muxjax.config import TaskConfig
 
 DOC = (Path(__file__).resolve().parent.parent / "docs" / "command_line.md").read_text()
 EXAMPLES = dict(re.findall(r"^\| `(\w+)` \|.*\| `(muxjax .*)` \|$", DOC, re.MULTILINE))
@@ -31,6 +33,12 @@ def muxjax(capsys, monkeypatch, tmp_path):
 
 def test_the_page_has_every_command_once():
     assert list(EXAMPLES) == sorted(COMMANDS)
+
+
+def test_the_task_file_on_the_page_is_one():
+    (text,) = re.findall(r"```yaml\n(.*?)```", DOC, re.DOTALL)
+    task = TaskConfig.model_validate(yaml.safe_load(text))
+    assert len(task.targets) == 2
 
 
 def test_an_unknown_option_is_bad_input(muxjax):

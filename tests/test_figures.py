@@ -28,7 +28,7 @@ from muxjax.hardware.accuracy import (
     random_targets,
     run_trial,
 )
-from muxjax.metrics.case_study import PANELS, Panel
+from muxjax.metrics.case_study import PANELS, Panel, case_study
 from muxjax.metrics.program import evaluate, timeline
 from muxjax.metrics.protocol import Protocol
 from muxjax.metrics.report import cell
@@ -369,7 +369,10 @@ def test_postures_drawn_are_the_equilibria():
     chain = load_chain("hyper_redundant")
     lengths = np.array([-4e-3, 0, 4e-3, 0, -6e-3, 0, 6e-3, 0])
     found = {"hanging": forward_statics(chain, displacements=lengths, gravity=[0, 0, 9.81])}
-    figure = drawn(mountings_figure(chain, found))
+    figure = drawn(mountings_figure(chain, found, {"hanging": [0, 0, 9.81]}))
+    (arrow,) = (text for text in figure.axes[0].texts if text.get_text() == "")
+    np.testing.assert_allclose(np.array(arrow.xy) - arrow.get_position(), [0, 0.18], atol=1e-9)
+    assert figure.axes[0].get_title().startswith("hanging\nconstant curvature is ")
     shape, bars = figure.axes
     lines = {line.get_label(): line.get_xydata() for line in shape.lines}
     tip = 1e3 * np.asarray(found["hanging"].pose)[[0, 2], 3]
@@ -530,6 +533,32 @@ def test_panels_state_what_their_program_takes(robot, programs):
     figure = programs_figure(robot, {panel.name: panel.program}, "t", letters="ab")
     title = figure.axes[1].get_title()
     assert title == f"(b) greedy\n{metrics.time_s:.1f} s, {metrics.stages} stages"
+
+
+def test_the_case_study_of_another_robot_says_its_limit_and_names_its_tendons(figure_command):
+    path = Path(__file__).resolve().parent.parent / "docs" / "tutorials" / "my_arm.yaml"
+    code, _, error = figure_command("fig6", "--robot", str(path), "--out", "six.png")
+    assert code == 2
+    assert "by up to 91.7 degrees, a segment of 'my_arm' bends by at most 90.0" in error
+    assert "--q-deg" in error
+    arm = muxjax.load_robot(path)
+    goal = np.asarray(muxjax.tendon_displacements(arm, np.radians([30.0, 0.0, 20.0, 90.0])))
+    rules = load_yaml(Protocol, resolve("table2", "bench"))
+    names = {panel.name for panel in case_study(arm, rules, goal)}
+    assert {"tendons 1 to 6, 1 servo", "tendons 6 to 1, 1 servo"} <= names
+
+
+def test_nine_panels_leave_one_place_blank_and_a_long_legend_has_two_even_rows(robot, programs):
+    program = next(iter(programs.values()))
+    figure = programs_figure(robot, {str(k): program for k in range(9)}, "t")
+    assert figure.axes[-1].get_subplotspec().get_gridspec().get_geometry() == (4, 5)
+    arm = muxjax.load_robot("penta")
+    goal = muxjax.tendon_displacements(arm, np.radians([30.0, 0.0] * 5))
+    plan = muxjax.plan(arm, muxjax.Problem(np.zeros(20), goal), "sequential")
+    long = programs_figure(arm, {"one": muxjax.schedule(arm, plan)}, "t")
+    words = [text.get_text() for text in long.legends[0].get_texts()]
+    assert words[0::2] == [f"segment {i}" for i in range(1, 6)]
+    assert words[1::2] == [*(f"tendon {j} of the segment" for j in range(1, 5)), "motion"]
 
 
 def test_the_page_shows_every_picture_of_the_gallery_and_they_are_small():

@@ -18,7 +18,14 @@ from muxjax.cli import main
 from muxjax.collision import load_world
 from muxjax.hardware import Journal, LockstepLink
 from muxjax.hardware.faults import FaultConfig
-from muxjax.hardware.journal import DoneEntry, Entry, LegEntry, ProgramEntry, ServoEntry
+from muxjax.hardware.journal import (
+    DoneEntry,
+    Entry,
+    LegEntry,
+    ProgramEntry,
+    ServoEntry,
+    SessionEntry,
+)
 from muxjax.hardware.log import LoggedLink
 from muxjax.metrics.program import timeline
 from muxjax.pipeline import run_to_target
@@ -41,6 +48,7 @@ from muxjax.viz.screenshot import (
     press,
     settle,
 )
+from muxjax.viz.surroundings import view_of
 from muxjax.viz.viewer import Viewer
 from tests.conftest import random_configurations
 
@@ -205,6 +213,25 @@ def test_surfaces_lie_where_the_collision_model_has_them(arm, name, kinds):
         np.testing.assert_allclose(np.linalg.norm(ring - line[0], axis=1), bore)
 
 
+@pytest.mark.parametrize("beside", [0.0, 0.6])
+@pytest.mark.parametrize("tall", [0.4, 1.0])
+def test_the_view_holds_every_point_beside_the_panel(rng, beside, tall):
+    points = rng.uniform([-0.4, -0.3, 0.0], [0.2 + beside, 0.2, tall], (200, 3))
+    place, onward = view_of(points)
+    right = np.cross(onward, [0.0, 0.0, 1.0])
+    right /= np.linalg.norm(right)
+    away = points - place
+    half = (away @ onward) * np.tan(np.radians(45) / 2)  # of the page's height, there
+    assert (half > 0).all()
+    across, up = away @ right / half, away @ np.cross(right, onward) / half
+    assert np.abs(up).max() <= 0.96 + 1e-9
+    assert across.min() >= -1.55 * 0.96 - 1e-9
+    assert across.max() <= 1.55 * 0.38 + 1e-9
+    # And it is no further away than it must be.
+    tight = np.ptp(np.r_[up.min(), up.max()]) > 1.8, across.max() - across.min() > 1.9
+    assert any(tight)
+
+
 def test_a_sampled_cloud_lies_within_reach(arm):
     points = sampled_cloud(arm, 500)
     assert points.dtype == np.float32
@@ -247,6 +274,7 @@ def test_a_programs_track_is_its_timeline_and_ends_at_the_target(arm, program):
         assert set(np.flatnonzero(moment.moving) + 1) <= set(item.clutches)
         assert moment.moving.any()
     assert track.marks[0].lost.tolist() == [False, True, False]
+    assert {track.at(time_s).left_out for time_s in line.time_s} == {(2,)}
 
 
 def test_a_turning_drum_is_between_its_positions(arm, program):
@@ -351,6 +379,22 @@ def test_a_journals_times_are_those_of_eq_14(arm, program):
             assert track.at(time_s).axial == pytest.approx(predicted.at(time_s).axial)
 
 
+def test_the_next_run_of_a_journal_begins_elsewhere_at_once(arm, program):
+    once = entries_of(arm, program)
+    one = track_of_journal(arm, once, "one")
+    ends, starts = np.array(program.target), np.array(program.start)
+    measured = SessionEntry(session=2, boot_count=1, lengths=tuple(starts))
+    for second in (once, [measured, *once[1:]]):  # a new program; the same one on a new board
+        two = track_of_journal(arm, [*once, *second], "two")
+        assert two.duration_s == pytest.approx(2 * one.duration_s, abs=0.01)
+        before, after = two.at(one.duration_s - 1e-9), two.at(one.duration_s)
+        np.testing.assert_allclose(before.displacements, ends, atol=1e-3)
+        np.testing.assert_allclose(after.displacements, starts, atol=1e-9)
+        assert not after.moving.any()
+        assert any("its start is elsewhere" in mark.phase for mark in two.marks)
+        np.testing.assert_allclose(two.at(two.duration_s).displacements, ends, atol=1e-3)
+
+
 def test_servos_that_a_program_left_out_are_back_in_the_next_one(arm, program):
     entries = entries_of(arm, program)  # servos 1 and 3
     later = ProgramEntry(program=replace(program, servos=(1, 2, 3)), goals=())
@@ -359,6 +403,9 @@ def test_servos_that_a_program_left_out_are_back_in_the_next_one(arm, program):
         [*entries, later],
         [*entries, ServoEntry(servo=3, reason="stalled"), later],
     )]  # fmt: skip
+    entry = track_of_journal(arm, [*entries, ServoEntry(servo=3, reason="stalled")], "mine")
+    assert [m.left_out for m in (entry.marks[0], entry.marks[-1])] == [(2,), (2,)]
+    assert entry.marks[-1].lost.tolist() == [False, True, True]
     assert lost == [[False, True, False], [False] * 3, [False, False, True]]
 
 
@@ -741,6 +788,22 @@ def test_bad_input_is_code_2(arguments, why, capsys, monkeypatch, tmp_path):
         main(["view", *arguments])
     assert stop.value.code == 2
     assert why in capsys.readouterr().err
+
+
+def test_a_time_after_the_timelines_end_is_said(arm, program, capsys, monkeypatch, tmp_path):
+    def interrupted(self):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(Viewer, "run", interrupted)
+    path = tmp_path / "program.json"
+    save_program(program, path)
+    ends = track_of_program(arm, program, "").duration_s
+    for at_s, said in ((500, True), (1, False)):
+        with pytest.raises(SystemExit) as end:
+            main(["view", str(path), "--at-s", str(at_s), "--port", "0"])
+        assert end.value.code == 0
+        found = f"--at-s {at_s}: the timeline ends at {ends:.2f} s" in capsys.readouterr().err
+        assert found == said
 
 
 def test_a_missing_browser_is_said(monkeypatch):

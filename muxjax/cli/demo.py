@@ -52,10 +52,11 @@ def demo(
     if not methods:
         raise ValueError("--methods: needs at least one planner")
     preset_weights(preset)  # a wrong name is refused before any work
-    out.mkdir(parents=True, exist_ok=True)
     began = time.perf_counter()
     arm = load_robot(robot)
     targets = load_yaml(TaskConfig, resolve(task, "tasks"))
+    _check_fits(arm, targets)
+    out.mkdir(parents=True, exist_ok=True)
     servo_sets = [tuple(range(1, n + 1)) for n in range(arm.tendons_per_segment, 0, -1)]
     outcomes: list[Outcome] = []
     for outcome in run_task(
@@ -80,6 +81,22 @@ def demo(
         console.print(f"pictures in {out}: {', '.join(p.name for p in pictures)}")
         console.print(f"done in {time.perf_counter() - began:.0f} s")
     return 0
+
+
+def _check_fits(arm: Robot, task: TaskConfig) -> None:
+    """Whether a task's configurations are of this robot's number of segments.
+
+    Raises:
+        ValueError: They are of another one.
+    """
+    for target in task.targets:
+        angles = target.near_q_deg
+        if angles is not None and len(angles) != 2 * arm.n_segments:
+            raise ValueError(
+                f"--task: {task.name!r} is for a robot of {len(angles) // 2} segments "
+                f"({target.name!r}, near_q_deg: {len(angles)} angles), {arm.config.name!r} has "
+                f"{arm.n_segments}; give a task of your own with --task (docs/command_line.md)"
+            )
 
 
 def _print_outcome(outcome: Outcome, *, first: bool) -> None:

@@ -84,7 +84,11 @@ def draw_fig6(
 
     rules = load_yaml(Protocol, resolve(protocol, "bench"))
     if q_deg is None:
-        goal, name = rules.target(arm, seed, target), f"target {target} of seed {seed}"
+        try:
+            goal = rules.target(arm, seed, target)
+        except ValueError as error:
+            raise ValueError(f"{error}, or the bending itself with --q-deg") from None
+        name = f"target {target} of seed {seed}"
     else:
         q = configuration_argument(arm, "--q-deg", q_deg)
         goal, name = np.asarray(tendon_displacements(arm, q)), "bending and azimuth as given"
@@ -284,7 +288,9 @@ def draw_statics(chain: str, displacements_mm: Sequence[float], payload_kg: floa
         for mounting, one in found.items()
     }
     header = ("mounting", "tip x, y, z [mm]", "largest tension [N]", "")
-    return Drawn(mountings_figure(arm, found), header, rows, {"chain": arm.name} | document)
+    return Drawn(
+        mountings_figure(arm, found, GRAVITY), header, rows, {"chain": arm.name} | document
+    )
 
 
 def draw_training(runs: Sequence[Path]) -> Drawn:

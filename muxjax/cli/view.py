@@ -115,6 +115,8 @@ def view(
                 notice(f"muxjax: {refusal}")  # the page says so too, and can mend it
         elif names:
             viewer.show_tracks(names[:2])
+        if at_s > viewer.duration_s:
+            notice(f"muxjax: --at-s {at_s:g}: the timeline ends at {viewer.duration_s:.2f} s")
         viewer.seek(at_s)
         if screenshot is not None:
             take_screenshot(viewer, screenshot, size, tab)

@@ -14,13 +14,14 @@ from muxjax.planning import plan
 from muxjax.robot import Robot
 from muxjax.scheduler import Program, schedule
 
-# Panels (b) to (g) of M Fig. 6 in its order, then ours: name, setting of the protocol, servos.
+# Panels (b) to (g) of M Fig. 6 in its order, then ours: name, of a robot of {n} tendons, setting of
+# the protocol, servos.
 PANELS = (
     ("BeamStep, 3 servos", "BeamStep, as printed", 3),
     ("BeamStep, 2 servos", "BeamStep, as printed", 2),
     ("greedy, 1 servo", "greedy", 1),
-    ("tendons 1 to 9, 1 servo", "tendons 1 to 9", 1),
-    ("tendons 9 to 1, 1 servo", "tendons 9 to 1", 1),
+    ("tendons 1 to {n}, 1 servo", "tendons 1 to 9", 1),
+    ("tendons {n} to 1, 1 servo", "tendons 9 to 1", 1),
     ("BeamStep, 1 servo", "BeamStep, as printed", 1),
     ("ours, 1 servo", "exact, least overshoot", 1),
     ("ours, 3 servos", "exact, least overshoot", 3),
@@ -66,7 +67,9 @@ def case_study(
                 f"protocol {protocol.name!r}: no setting is named {wanted!r}; "
                 "configs/bench/table2.yaml has all of them"
             )
-        yield _panel(robot, protocol, target, name, settings[wanted], servos)
+        yield _panel(
+            robot, protocol, target, name.format(n=robot.n_tendons), settings[wanted], servos
+        )
 
 
 def _panel(

@@ -120,7 +120,9 @@ class Protocol(Strict):
         low, high = self.theta_rad.value
         if high > robot.theta_max.min():
             raise ValueError(
-                f"theta_rad: reaches {high:g}, the robot's limit is {robot.theta_max.min():g}"
+                f"protocol {self.name!r}: theta_rad: its targets bend each segment by up to "
+                f"{np.degrees(high):.1f} degrees, a segment of {robot.config.name!r} bends by at "
+                f"most {np.degrees(robot.theta_max.min()):.1f}; give a protocol with a lower one"
             )
         rng = np.random.default_rng([seed, number - 1])
         theta = rng.uniform(low, high, robot.n_segments)

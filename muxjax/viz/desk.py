@@ -24,7 +24,7 @@ from muxjax.tendons import (
     displacement_range,
     tendon_displacements,
 )
-from muxjax.viz.playback import Moment, Track, still, track_of_program
+from muxjax.viz.playback import Moment, Track, numbers_of, still, track_of_program
 
 MOST_GHOSTS = 8
 # What of the target counts, as weights of ``ik.all_ik``.
@@ -148,7 +148,7 @@ class Desk:
     @property
     def servos(self) -> tuple[int, ...]:
         """Servos that are left, from 1."""
-        return tuple(int(s) + 1 for s in np.flatnonzero(~self.failed))
+        return numbers_of(~self.failed)
 
     def solve(self, pose: Float[np.ndarray, "4 4"]) -> str:
         """Configurations that reach a pose, or what of it counts; what was found, in words.

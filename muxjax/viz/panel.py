@@ -63,7 +63,7 @@ def build_panel(gui: GuiApi, desk: Desk, method: str, colour: str, parts: tuple[
     """
     robot = desk.robot
     status = gui.add_markdown("")
-    with gui.add_folder("failed servos"):
+    with gui.add_folder("failed servos: a new plan does without"):
         failed = [
             gui.add_checkbox(f"servo {s + 1} failed", bool(desk.failed[s]))
             for s in range(robot.tendons_per_segment)

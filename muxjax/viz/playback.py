@@ -23,14 +23,16 @@ class Marks:
     Attributes:
         since_s: [s].
         engaged: Tendons whose clutches are in.
-        lost: Servos that cannot be used.
+        lost: Servos that are out of use.
         phase: In words.
+        left_out: Those of them, from 1, that have not failed: the program does without them.
     """
 
     since_s: float
     engaged: Bool[np.ndarray, " SJ"]
     lost: Bool[np.ndarray, " J"]
     phase: str
+    left_out: tuple[int, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,8 +44,9 @@ class Moment:
         moving: Tendons that move.
         axial: Axial position from 0, fractions between two; None if not known.
         engaged: Tendons whose clutches are in.
-        lost: Servos that cannot be used.
+        lost: Servos that are out of use.
         phase: In words.
+        left_out: Those of them, from 1, that have not failed: the program does without them.
     """
 
     displacements: Float[np.ndarray, " SJ"]
@@ -52,6 +55,7 @@ class Moment:
     engaged: Bool[np.ndarray, " SJ"]
     lost: Bool[np.ndarray, " J"]
     phase: str
+    left_out: tuple[int, ...] = ()
 
     @property
     def slot(self) -> int:
@@ -99,7 +103,9 @@ class Track:
         axial = None
         if len(self.axial_s):
             axial = float(np.interp(time_s, self.axial_s, self.axial))
-        return Moment(now, fast & mark.engaged, axial, mark.engaged, mark.lost, mark.phase)
+        return Moment(
+            now, fast & mark.engaged, axial, mark.engaged, mark.lost, mark.phase, mark.left_out
+        )
 
     def _index(self, time_s: float) -> int:
         times = [mark.since_s for mark in self.marks]
@@ -122,8 +128,9 @@ def track_of_program(robot: Robot, program: Program, name: str) -> Track:
     """
     line = timeline(robot, program)
     lost = lost_servos(robot, program.servos)
+    left_out = numbers_of(lost)
     none = np.zeros(robot.n_tendons, bool)
-    marks = [Marks(0.0, none, lost, "at rest")]
+    marks = [Marks(0.0, none, lost, "at rest", left_out)]
     axial_s, axial = [0.0], [axial_before(program)]
     point, count = 1, len(program.instructions)
     for number, item in enumerate(program.instructions, start=1):
@@ -136,13 +143,15 @@ def track_of_program(robot: Robot, program: Program, name: str) -> Track:
         turned = item.axial - 1.0
         stage = f"stage {number} of {count}"
         if turned != axial[-1]:
-            marks.append(Marks(waits, none, lost, f"{stage}: drum turns to {item.axial}"))
-        marks.append(Marks(engage, engaged, lost, f"{stage}: clutches engage"))
-        marks.append(Marks(begin, engaged, lost, f"{stage}: {move_words(item.clutches)}"))
+            marks.append(Marks(waits, none, lost, f"{stage}: drum turns to {item.axial}", left_out))
+        marks.append(Marks(engage, engaged, lost, f"{stage}: clutches engage", left_out))
+        moves = f"{stage}: {move_words(item.clutches)}"
+        marks.append(Marks(begin, engaged, lost, moves, left_out))
         axial_s += [waits, engage]
         axial += [axial[-1], turned]
         point += len(item.via) + 1
-        marks.append(Marks(end, none, lost, "done" if number == count else f"{stage}: over"))
+        over = "done" if number == count else f"{stage}: over"
+        marks.append(Marks(end, none, lost, over, left_out))
     return Track(
         name,
         "predicted, times of M Eq. 14",
@@ -175,3 +184,8 @@ def move_words(tendons: Sequence[int]) -> str:
 def lost_servos(robot: Robot, servos: tuple[int, ...]) -> Bool[np.ndarray, " J"]:
     """Servos that are not among these, from 1."""
     return ~np.isin(np.arange(1, robot.tendons_per_segment + 1), servos)
+
+
+def numbers_of(servos: Bool[np.ndarray, " J"]) -> tuple[int, ...]:
+    """Numbers, from 1, of the servos that are marked."""
+    return tuple(int(s) + 1 for s in np.flatnonzero(servos))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from itertools import zip_longest
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +24,8 @@ from muxjax.viz.scene import guide_frames, tendon_points
 from muxjax.viz.style import MARKERS, SEGMENT_COLOURS, STYLE, TENDON_STYLES, save_figure
 
 _POINTS_A_SEGMENT = 24
-_PANELS_A_ROW = 4
+_PANELS_A_ROW = 5
+_NAMES_A_ROW = 7  # of the legend, before it takes two rows
 _FRAMES_A_SECOND = 10
 
 
@@ -77,8 +79,8 @@ def _programs_figure(
     robot: Robot, programs: Mapping[str, Program], title: str, letters: list[str]
 ) -> Figure:
     letters = letters or [""] * (len(programs) + 1)
-    columns = min(len(programs), _PANELS_A_ROW)
-    bands = -(-len(programs) // columns)
+    bands = -(-len(programs) // _PANELS_A_ROW)
+    columns = -(-len(programs) // bands)  # as few blank places as can be
     figure = Figure(figsize=(1.75 * columns + 3.0, 3.3 * bands + 0.6), layout="constrained")
     figure.suptitle(title)
     left, right = figure.subfigures(1, 2, squeeze=False, width_ratios=[2.8, 1.75 * columns])[0]
@@ -114,7 +116,7 @@ def _programs_figure(
             angles.set_ylabel("bending angle [deg]")
     # Of all panels, which share their scales: a limit before the last one would cut those after it.
     top[1].set_ylim(0, top[1].get_ylim()[1])
-    figure.legend(*_legend(robot), loc="outside lower center", ncols=7)
+    _add_legend(figure, robot)
     return figure
 
 
@@ -146,7 +148,8 @@ def _shade_motion(axes: Any, line: Trajectory) -> None:
     axes.set_xlim(0, max(line.time_s[-1], 1e-9))
 
 
-def _legend(robot: Robot) -> tuple[list[Any], list[str]]:
+def _add_legend(figure: Figure, robot: Robot) -> None:
+    """Names of segments, tendons and motion: in one row, or segments above the others."""
     segments = [
         mpl.lines.Line2D([], [], color=colour(i), lw=1.5, marker=marker(i), ms=4)
         for i in range(robot.n_segments)
@@ -156,9 +159,21 @@ def _legend(robot: Robot) -> tuple[list[Any], list[str]]:
         for j in range(robot.tendons_per_segment)
     ]
     motion = mpl.patches.Patch(color="0.5", alpha=0.15, lw=0)
-    names = [f"segment {i + 1}" for i in range(robot.n_segments)]
-    names += [f"tendon {j + 1} of the segment" for j in range(robot.tendons_per_segment)]
-    return [*segments, *tendons, motion], [*names, "motion"]
+    above = [(line, f"segment {i}") for i, line in enumerate(segments, start=1)]
+    below: list[tuple[Any, str]] = [
+        (line, f"tendon {j} of the segment") for j, line in enumerate(tendons, start=1)
+    ]
+    below.append((motion, "motion"))
+    names = [*above, *below]
+    if len(names) > _NAMES_A_ROW:
+        blank = mpl.lines.Line2D([], [], ls="none"), ""
+        # Legends fill columns first.
+        names = [n for both in zip_longest(above, below, fillvalue=blank) for n in both]
+        columns = len(names) // 2
+    else:
+        columns = len(names)
+    handles, words = zip(*names, strict=True)
+    figure.legend(handles, words, loc="outside lower center", ncols=columns)
 
 
 def draw_arm(
@@ -237,7 +252,7 @@ def _frame_arm(axes: Any, robot: Robot) -> None:
         (axes.set_xlim, axes.set_ylim, axes.set_zlim), middle, strict=True
     ):
         set_limits(centre - half, centre + half)
-    axes.set_box_aspect((1, 1, 1))
+    axes.set_box_aspect((1, 1, 1), zoom=0.85)  # so that the axes' names have room beside it
     axes.set_xlabel("x [mm]", fontsize=8)
     axes.set_ylabel("y [mm]", fontsize=8)
     axes.set_zlabel("z [mm]", fontsize=8)

@@ -28,8 +28,11 @@ from muxjax.viz.playback import (
     axial_before,
     lost_servos,
     move_words,
+    numbers_of,
     track_of_program,
 )
+
+_ELSEWHERE = 5e-4  # least difference of a beginning from the end before it; less is slip [m]
 
 
 def read_track(robot: Robot, path: str | Path) -> Track:
@@ -78,7 +81,8 @@ def track_of_journal(robot: Robot, entries: list[Entry], name: str) -> Track:
     """Where a journal says that the wheels were.
 
     A journal has no clock: between two of its lines as much time is put as M Eq. 14 gives the
-    motion.
+    motion. A program or a session that begins where no clutch can have brought the wheels, as the
+    next run of the same journal does, is there at once.
 
     Raises:
         ValueError: Its program was made for another robot, or it holds none.
@@ -94,14 +98,21 @@ def track_of_journal(robot: Robot, entries: list[Entry], name: str) -> Track:
     axial_s, positions = list[float](), list[float]()
     program: Program | None = None
     for entry in entries:
-        phase = marks[-1].phase if marks else "at rest"
+        phase, jumps = marks[-1].phase if marks else "at rest", False
         if isinstance(entry, ProgramEntry):
             check_same_robot(robot, entry.program)
             program = entry.program
             lost = failed | lost_servos(robot, program.servos)
-            if not points:
-                now, axial = np.array(program.start), axial_before(program)
+            start = np.array(program.start)
             phase = f"a program of {len(program.instructions)} stages begins"
+            jumps = bool(points) and bool(np.max(np.abs(start - now)) > _ELSEWHERE)
+            if jumps:
+                axial_s.append(time_s)
+                positions.append(axial)
+            if jumps or not points:
+                now, axial = start, axial_before(program)
+                axial_s.append(time_s)
+                positions.append(axial)
         elif isinstance(entry, ServoEntry):
             one = np.arange(len(failed)) == entry.servo - 1
             failed, lost = failed | one, lost | one
@@ -110,7 +121,10 @@ def track_of_journal(robot: Robot, entries: list[Entry], name: str) -> Track:
             reached = np.array(
                 [old if new is None else new for new, old in zip(entry.lengths, now, strict=True)]
             )
-            time_s += float(np.max(np.abs(reached - now))) / float(robot.tendon_speed)
+            moved = np.abs(reached - now)
+            jumps = isinstance(entry, SessionEntry) and bool(np.any(moved[~engaged] > _ELSEWHERE))
+            if not jumps:
+                time_s += float(np.max(moved)) / float(robot.tendon_speed)
             now = reached
         if isinstance(entry, LegEntry) and program is not None:
             stage = f"stage {entry.visit} of {len(program.instructions)}"
@@ -122,7 +136,8 @@ def track_of_journal(robot: Robot, entries: list[Entry], name: str) -> Track:
                 times.append(time_s)
                 points.append(now)
                 what = f"drum turns to {slot + 1}" if turns else "clutches engage"
-                marks.append(Marks(time_s, none, lost, f"{stage}: {what}"))
+                out = numbers_of(lost & ~failed)
+                marks.append(Marks(time_s, none, lost, f"{stage}: {what}", out))
                 time_s += float(robot.switch_time if turns else robot.engage_time)
                 axial = float(slot)
                 axial_s.append(time_s - float(robot.engage_time))
@@ -135,9 +150,11 @@ def track_of_journal(robot: Robot, entries: list[Entry], name: str) -> Track:
             engaged, phase = none, "the board is armed"
         elif isinstance(entry, EndEntry):
             engaged, phase = none, entry.reason
+        if jumps:
+            engaged, phase = none, f"{phase}; its start is elsewhere"
         times.append(time_s)
         points.append(now)
-        marks.append(Marks(time_s, engaged, lost, phase))
+        marks.append(Marks(time_s, engaged, lost, phase, numbers_of(lost & ~failed)))
     assert program is not None  # a journal begins with a program
     return Track(
         name,

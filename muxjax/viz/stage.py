@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import product
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -27,6 +28,8 @@ if TYPE_CHECKING:
 
 _DISC = 0.0026  # thickness of a drawn disc [m]
 _BESIDE = (-0.21, -0.14, 0.0)  # of the drum from the arm's root, in its frame [m]
+_TARGET = 0.14  # length of the target's arrows [m]
+_NAME = 0.07  # what a servo's name takes beyond it [m]
 _BLACK, _GREY, _RED = (25, 25, 25), (120, 120, 120), (190, 0, 30)
 
 
@@ -62,6 +65,26 @@ class Stage:
             anchor="bottom-center",
             visible=False,
         )
+
+    def box(self) -> Float[np.ndarray, "16 3"]:
+        """Corners around the straight arm with a target at its tool, and around the drum [m]."""
+        robot = self._robot
+        base, size = np.asarray(robot.base), float(np.sum(robot.length))
+        tool = float(np.linalg.norm(robot.tool[:3, 3]))
+        aside = float(robot.body_radius) + _TARGET / 2
+        out = drum.RADIUS + drum.GAP + drum.SERVO[0] + _NAME
+        local = [
+            *product((-aside, aside), (-aside, aside), (0.0, size + tool + _TARGET)),
+            *(
+                np.array(corner) + _BESIDE
+                for corner in product(
+                    (-out, out),
+                    (-drum.RADIUS, drum.RADIUS),
+                    (-drum.LAYER / 2, self._top + drum.LAYER / 2),
+                )
+            ),
+        ]
+        return np.asarray(local) @ base[:3, :3].T + base[:3, 3]
 
     def _add_arm(self, frames: Float[np.ndarray, "D 4 4"]) -> None:
         robot, scene, name = self._robot, self._scene, self._name
@@ -193,10 +216,11 @@ class Stage:
         for s, (box, label) in enumerate(zip(self._servos, self._names, strict=True)):
             place = drum.servo_place(robot, s, 0.0 if axial is None else axial)
             box.position, box.wxyz = place.frame[:3, 3], quaternion(place.frame[:3, :3])
-            failed = bool(moment.lost[s])
+            lost = bool(moment.lost[s])
             turns = bool(moment.slot) and bool(moment.moving[drum.facing(robot, moment.slot)[s]])
-            box.color = (115, 115, 115) if failed else ((200, 70, 0) if turns else (70, 70, 70))
-            state = ": out of use" if failed else (" turns" if turns else "")
+            box.color = (115, 115, 115) if lost else ((200, 70, 0) if turns else (70, 70, 70))
+            why = ": not in the program" if s + 1 in moment.left_out else ": failed"
+            state = why if lost else (" turns" if turns else "")
             label.text = f"servo {s + 1}{state}"
             # Above the drum, on a mast, no name is hidden by it.
             label.position = place.frame[:3, 3] * [1, 1, 0] + (self._top + 0.002) * _UP

@@ -73,12 +73,17 @@ def draw_posture(chain: ElasticChain, found: Equilibrium, path: str | Path) -> P
     return save_figure(figure, path, dpi=150)
 
 
-def mountings_figure(chain: ElasticChain, found: Mapping[str, Equilibrium]) -> Figure:
+def mountings_figure(
+    chain: ElasticChain,
+    found: Mapping[str, Equilibrium],
+    gravity: Mapping[str, Sequence[float]],
+) -> Figure:
     """The same tendon lengths under other directions of gravity: postures, and tensions below.
 
     Args:
         chain: The arm.
         found: Equilibria without batch axes, by how the arm is mounted.
+        gravity: Its acceleration, by the same [m/s^2]; an arrow in each panel, in the arm's frame.
     """
     with mpl.rc_context(STYLE):
         figure = Figure(figsize=(2.6 * len(found), 5.2), layout="constrained")
@@ -87,9 +92,10 @@ def mountings_figure(chain: ElasticChain, found: Mapping[str, Equilibrium]) -> F
         everything = np.concatenate([line for lines in shapes.values() for line in lines.values()])
         for axes, (name, lines) in zip(grid[0], shapes.items(), strict=True):
             _draw_shapes(axes, lines)
+            _draw_weight(axes, gravity[name])
             gap = np.linalg.norm(lines["statics"][-1] - lines["constant curvature"][-1])
             state = "" if found[name].converged else ", NO EQUILIBRIUM"
-            axes.set_title(f"{name}: constant curvature\n{gap:.0f} mm off at the tip{state}")
+            axes.set_title(f"{name}\nconstant curvature is {gap:.0f} mm off\nat the tip{state}")
         _same_scale(grid[0], everything, across=[0] * len(found))
         largest = max(float(np.max(one.tension)) for one in found.values())
         for axes, one in zip(grid[1], found.values(), strict=True):
@@ -120,6 +126,18 @@ def _draw_shapes(axes: Any, lines: Mapping[str, Float[np.ndarray, "P 3"]]) -> No
         axes.plot(*line[:, [0, 2]].T, label=name, **looks[name])
     axes.set_xlabel("x [mm]")
     axes.set_ylabel("z [mm]")
+
+
+def _draw_weight(axes: Any, gravity: Sequence[float]) -> None:
+    """An arrow in a lower corner that says where weight pulls, in the plane of the panel."""
+    x, z = np.array(gravity, dtype=float)[[0, 2]] / np.linalg.norm(gravity)
+    middle, half = np.array([0.84, 0.2]), 0.09 * np.array([x, z])
+    axes.annotate(
+        "", middle + half, middle - half, xycoords="axes fraction", textcoords="axes fraction",
+        arrowprops={"arrowstyle": "-|>", "color": INK, "lw": 1.6},
+    )  # fmt: skip
+    axes.text(0.84, 0.05, "weight", transform=axes.transAxes, ha="center", va="center", fontsize=8,
+              color=INK)  # fmt: skip
 
 
 def _mark_ends(axes: Any, points: Float[np.ndarray, "S 2"]) -> None:

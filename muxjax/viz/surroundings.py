@@ -18,6 +18,10 @@ if TYPE_CHECKING:
     from viser import SceneApi, ViserServer
 
 _OBSTACLE = {"round": 0.75, "box": 0.6, "plane": 0.25, "tube": 0.22}  # opacity
+_FIELD = float(np.radians(45))  # from the page's bottom to its top
+_ASPECT = 1.55  # width over height of the narrowest page that shows all
+_MARGIN = 0.96  # share of half the page's height, and of half its width on the left, that is used
+_FREE = 0.38  # share of half its width on the right, before the panel
 
 
 def add_light(scene: SceneApi) -> None:
@@ -30,16 +34,52 @@ def add_light(scene: SceneApi) -> None:
         scene.add_light_directional(f"/light/{number}", position=place, intensity=intensity)
 
 
-def place_cameras(server: ViserServer, robot: Robot, beside: float) -> None:
-    """Have everybody look at the arm, or at two of them that stand ``beside`` each other [m]."""
+def place_cameras(
+    server: ViserServer, robot: Robot, beside: float, box: Float[np.ndarray, "n 3"]
+) -> None:
+    """Have everybody look at the arm, or at two of them that stand ``beside`` each other [m].
+
+    Args:
+        server: Whose browsers look.
+        robot: The arm.
+        beside: From the first arm to the second; 0 for one arm.
+        box: Points that are to be in sight around the first arm [m].
+    """
+    points = np.concatenate([box, box + np.array([beside, 0.0, 0.0])])
+    place, onward = view_of(points)
     base, size = np.asarray(robot.base), float(np.sum(robot.length))
-    look = base[:3, 3] + 0.41 * size * base[:3, 2]
-    look = look + np.array([0.62 * beside + 0.16 * size, 0.0, 0.0])  # the panel covers the right
-    place = look + size * (3.0 if beside else 2.1) * np.array([-0.28, -0.9, 0.36])
+    middle = base[:3, 3] + 0.41 * size * base[:3, 2] + np.array([0.5 * beside, 0.0, 0.0])
+    look = place + onward * ((middle - place) @ onward)  # people turn the scene about it
     cameras: list[Any] = [client.camera for client in server.get_clients().values()]
     for camera in (server.initial_camera, *cameras):
         camera.position, camera.look_at = place, look
-        camera.fov = float(np.radians(45))
+        camera.fov = _FIELD
+
+
+def view_of(
+    points: Float[np.ndarray, "n 3"],
+) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]]:
+    """Nearest place from which points are in sight [m], and the unit vector of the view.
+
+    In sight means: on a page of ``_ASPECT`` or wider, beside the panel that covers its right.
+    """
+    onward = np.array([0.28, 0.9, -0.36])
+    onward /= np.linalg.norm(onward)
+    right = np.cross(onward, [0.0, 0.0, 1.0])
+    right /= np.linalg.norm(right)
+    turn = np.stack([right, np.cross(right, onward), onward])  # to the right, up, away
+    x, y, z = turn @ points.T
+    tangent = np.tan(_FIELD / 2)
+    up = _MARGIN * tangent
+    left, free = _ASPECT * up, _ASPECT * _FREE * tangent
+    # A point at depth z - d of a camera at (a, b, d) is in sight if
+    # -left (z - d) <= x - a <= free (z - d) and |y - b| <= up (z - d).
+    least_a, most_a = np.max(x - free * z), np.min(x + left * z)
+    least_b, most_b = np.max(y - up * z), np.min(y + up * z)
+    d = min((most_a - least_a) / (left + free), (most_b - least_b) / (2 * up))
+    a = 0.5 * (least_a + free * d + most_a - left * d)
+    b = 0.5 * (least_b + most_b)
+    return turn.T @ np.array([a, b, d]), onward
 
 
 def add_grid(scene: SceneApi, robot: Robot) -> None:
@@ -106,10 +146,12 @@ def add_ghosts(
             cast_shadow=False,
         )
         tube.on_click(partial(_clicked, on_click, k))
-        # Solutions meet at the tip and at the root: the numbers stand halfway.
-        middle = line[len(line) // 2]
-        text = f"solution {k + 1}" + (" (chosen)" if mine else "")
-        scene.add_label(f"/ghosts/{k + 1}/name", text, position=middle)  # goes with its tube
+        # Solutions meet at the tip and at the root: the numbers stand in between, spread along it.
+        share = 0.3 + 0.5 * (k + 0.5) / len(solutions)
+        text = f"solution {k + 1} (chosen)" if mine else str(k + 1)
+        scene.add_label(  # goes with its tube
+            f"/ghosts/{k + 1}/name", text, position=line[round(share * (len(line) - 1))]
+        )
         drawn.append(tube)
     return drawn
 

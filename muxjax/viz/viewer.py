@@ -84,7 +84,7 @@ class Viewer:
         self.refresh_tracks()
         self._move_gizmo(desk.target)
         self._sync()
-        place_cameras(self.server, robot, 0.0)
+        place_cameras(self.server, robot, 0.0, self.left.box())
         self.say("Bend the arm, or drag the target and press Plan.")
 
     @property
@@ -372,7 +372,7 @@ class Viewer:
         if right != bool(self.right.root.visible):
             self.right.root.visible = right
             beside = float(self.right.root.position[0]) if right else 0.0
-            place_cameras(self.server, self.desk.robot, beside)
+            place_cameras(self.server, self.desk.robot, beside, self.left.box())
 
     def seek(self, time_s: float) -> None:
         """Go to a time [s] of the tracks that are shown."""

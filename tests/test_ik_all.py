@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import json
 from pathlib import Path
 
@@ -215,7 +216,9 @@ def test_batches_are_the_sum_of_their_rows_and_frames_belong_to_the_pose(muxarm,
 
 def segments_of(robot: Robot, count: int) -> Robot:
     raw = robot.config.model_dump(by_alias=True)
-    parts = (raw["segments"] * 2)[:count]
+    parts = [copy.deepcopy(raw["segments"][k % 3]) for k in range(count)]
+    for k, part in enumerate(parts):  # no tendon on another one
+        part["tendon_offset_deg"]["value"] = 120.0 * k / count
     return robot_from_config(RobotConfig.model_validate(raw | {"segments": parts}))
 
 

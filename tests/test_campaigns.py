@@ -37,6 +37,12 @@ def test_more_of_the_same(muxarm, first):
         assert not verdict.offences, (seed, verdict.offences, verdict.steps)
 
 
+def test_a_wheel_that_one_noisy_reading_takes_for_right_is_looked_at_again(muxarm):
+    """Found by a long campaign: left 0.0205 mm off when a single reading decided."""
+    verdict = run(muxarm, draw(muxarm, 9554))
+    assert not verdict.offences, (verdict.offences, verdict.steps)
+
+
 def test_a_seed_plays_the_same_again(muxarm):
     one, two = (run(muxarm, draw(muxarm, 11)) for _ in range(2))
     assert one == two

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Iterator
 from pathlib import Path
 
 # The workers, and later runs, share what has been compiled: most of the tests' time.
@@ -36,11 +37,24 @@ SHAPED = [
 ]
 install_import_hook([f"muxjax.{room}" for room in SHAPED], "beartype.beartype")
 
+import jax
 import numpy as np
 import pytest
 
 import muxjax
 from muxjax.robot import Robot
+
+MOST_MAPS = 20_000
+
+
+@pytest.fixture(scope="module", autouse=True)
+def few_compiled_functions() -> Iterator[None]:
+    """Linux gives a process 65 530 memory maps; compiled functions take some each, and at the last
+    one XLA aborts the worker with all its tests."""
+    yield
+    maps = Path("/proc/self/maps")
+    if maps.exists() and maps.read_bytes().count(b"\n") > MOST_MAPS:
+        jax.clear_caches()
 
 
 @pytest.fixture(scope="session", params=["muxarm", "penta"])

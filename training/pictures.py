@@ -57,7 +57,10 @@ def picture_of_front(records: tuple[Path, ...], out: Path = Path("out/front.png"
         for handle, label in zip(*panel.get_legend_handles_labels(), strict=True):
             handles.setdefault(label, handle)
     figure.legend(list(handles.values()), list(handles), loc="outside lower center", ncols=6)
-    return _written(figure, out)
+    out.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(out, dpi=160)
+    print(out)
+    return 0
 
 
 def _draw_front(panel: Any, records: Sequence[Record]) -> None:
@@ -79,13 +82,6 @@ def _draw_front(panel: Any, records: Sequence[Record]) -> None:
     panel.yaxis.set_major_formatter("{x:g}")
     panel.set_ylim(bottom=-0.1)
     panel.grid(alpha=0.3)
-
-
-def _written(figure: Figure, out: Path) -> int:
-    out.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(out, dpi=160)
-    print(out)
-    return 0
 
 
 if __name__ == "__main__":

@@ -21,7 +21,7 @@ from muxjax.hardware.executor import execute as execute_closed
 from muxjax.hardware.journal import LegEntry, MemoryJournal, ProgramEntry
 from muxjax.hardware.links import LockstepLink
 from muxjax.hardware.physics import PhysicsConfig, load_physics
-from muxjax.hardware.protocol import Frame
+from muxjax.hardware.protocol import SERVO_BITS_PER_RAD, Frame
 from muxjax.hardware.session import Script
 from muxjax.hardware.visits import Visit, load_visits
 from muxjax.kinematics import segment_ends
@@ -99,7 +99,7 @@ class OpenLoop(Executor):
 
 
 def _bits(angles: Mapping[int, float]) -> dict[int, int]:
-    return {servo: round(np.rad2deg(angle) * 10) for servo, angle in angles.items()}
+    return {servo: round(angle * SERVO_BITS_PER_RAD) for servo, angle in angles.items()}
 
 
 @dataclass(frozen=True, eq=False)

@@ -80,6 +80,12 @@ class Sensors:
         """Whether no clutch is energised or still coupled."""
         return self.clutches[1:] == (0, 0)
 
+    def tendons_of(self, mask: int) -> list[int]:
+        """Tendons, from 1, of a mask of the layer's clutches: those energised or those verified."""
+        layer, per_layer = self.clutches[0], len(self.servo_rad)
+        held = [k for k in range(per_layer) if layer and mask >> k & 1]
+        return [(layer - 1) * per_layer + k + 1 for k in held]
+
     def displacements(self) -> Float[np.ndarray, " S*J"]:
         """Displacements [m] by the wheel encoders; NaN where a wheel's turn is not known."""
         return np.where(self._anchored, np.array(self._counts) * self.metres_per_count, np.nan)

@@ -169,9 +169,7 @@ class Transaction(Handshake):
     def _blame_held_clutches(self, op: str) -> Script[None]:
         """Name the clutches whose wheels still follow. Always fails."""
         yield from self._until(lambda: self.sensors.clutches[2] != 0, SENSOR_WAIT_S)
-        layer, _, held = self.sensors.clutches
-        first = (layer - 1) * self.robot.tendons_per_segment + 1
-        tendons = [first + k for k in range(self.robot.tendons_per_segment) if held >> k & 1]
+        tendons = self.sensors.tendons_of(self.sensors.clutches[2])
         raise Failed(
             f"{op} aborted by the board: NOT_RELEASED, clutches {tendons} are still in",
             After.REPAIR,

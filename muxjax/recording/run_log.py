@@ -81,7 +81,7 @@ def read_log(robot: Robot, path: str | Path) -> LoggedRun:
             ran a program of another robot, or no moment at which the board has reported everything.
     """
     sensors, port, refused, drum = Sensors(robot), Port("HOST"), 0, np.nan
-    board = Port("BOARD")
+    board, numbers = Port("BOARD"), np.arange(1, robot.n_tendons + 1)
     last_group = f"WHEEL_FB_{(robot.n_tendons - 1) // 3 % 3 + 1}", (robot.n_tendons - 1) // 9
     times: list[float] = []
     rows: list[tuple[Any, ...]] = []
@@ -113,14 +113,15 @@ def read_log(robot: Robot, path: str | Path) -> LoggedRun:
             times.append(at_s)
             stuck = np.array([bool(bits & (STALLED | OFFLINE)) for bits in sensors.servo_status])
             servo = sensors.servo_rad.copy(), stuck
-            drive = sensors.slot, drum, _engaged(robot, sensors.clutches), sensors.state
+            engaged = np.isin(numbers, sensors.tendons_of(sensors.clutches[1]))
+            drive = sensors.slot, drum, engaged, sensors.state
             rows.append((sensors.displacements(), *servo, *drive))
     if not rows:
         raise ConfigError(
             f"{path}: at no moment has every wheel and every servo of {robot.config.name!r} "
             "reported; is it the log of a run of this robot?"
         )
-    lengths, servos, stopped, axial, drums, engaged, state = zip(*rows, strict=True)
+    lengths, servos, stopped, axial, drums, coupled, state = zip(*rows, strict=True)
     return LoggedRun(
         np.array(times),
         np.stack(lengths),
@@ -128,7 +129,7 @@ def read_log(robot: Robot, path: str | Path) -> LoggedRun:
         np.stack(stopped),
         np.array(axial),
         np.array(drums),
-        np.stack(engaged),
+        np.stack(coupled),
         state,
         refused,
     )
@@ -190,14 +191,3 @@ def _check_robot(robot: Robot, path: str | Path, asked: Received) -> None:
             f"{path}: the host ran a program of another robot; this is {robot.config.name!r} "
             f"({robot.fingerprint})"
         )
-
-
-def _engaged(robot: Robot, clutches: tuple[int, int, int]) -> Bool[np.ndarray, " SJ"]:
-    """Energised clutches by tendon: a mask of one layer's."""
-    layer, mask, _ = clutches
-    found = np.zeros(robot.n_tendons, dtype=bool)
-    j = robot.tendons_per_segment
-    for k in range(j):
-        if layer and mask >> k & 1:
-            found[(layer - 1) * j + k] = True
-    return found

@@ -5,6 +5,8 @@ Every refusal is a ``ValueError`` whose message a person can act on, and leaves 
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import jax
 import numpy as np
 from jaxtyping import Bool, Float
@@ -86,10 +88,7 @@ class Desk:
     @property
     def now(self) -> Moment:
         """The arm at rest as it stands, with the failed servos."""
-        rest = still(self.robot, self.displacements, self.axial)
-        return Moment(
-            rest.displacements, rest.moving, rest.axial, rest.engaged, self.failed, rest.phase
-        )
+        return replace(still(self.robot, self.displacements, self.axial), lost=self.failed)
 
     def set_q_deg(self, q_deg: Float[np.ndarray, " dof"]) -> None:
         """Bend the arm; tendons follow (M Eq. 6).

@@ -54,15 +54,11 @@ def draw_posture(chain: ElasticChain, found: Equilibrium, path: str | Path) -> P
     """
     figure = Figure(figsize=(9.6, 3.9), layout="constrained")
     views = figure.subplots(1, 3, width_ratios=[1, 1, 1.1])
-    home, pcc, ours = _shapes(chain, found).values()
+    lines = _shapes(chain, found)
+    home, pcc, ours = lines.values()
     for axes, across in zip(views[:2], (0, 1), strict=True):
-        axes.plot(*home[:, [across, 2]].T, color=GREY, lw=1, ls=":", label="straight")
-        axes.plot(*pcc[:, [across, 2]].T, color=_METHODS["PCC from lengths"], ls="--", lw=1.8,
-                  label="constant curvature")  # fmt: skip
-        axes.plot(*ours[:, [across, 2]].T, color=_METHODS["FSL"], lw=2.6, label="statics")
+        _draw_shapes(axes, lines, across=across, widths=(1.0, 1.8, 2.6))
         _mark_ends(axes, 1e3 * np.asarray(found.segment_ends)[:, :3, 3][:, [across, 2]])
-        axes.set_xlabel(f"{'xy'[across]} [mm]")
-        axes.set_ylabel("z [mm]")
     _same_scale(views[:2], np.concatenate([ours, pcc, home]))
     handles = views[0].get_legend_handles_labels()
     figure.legend(*handles, loc="outside lower left", ncols=3, fontsize=8, frameon=False)
@@ -91,7 +87,7 @@ def mountings_figure(
         shapes = {name: _shapes(chain, one) for name, one in found.items()}
         everything = np.concatenate([line for lines in shapes.values() for line in lines.values()])
         for axes, (name, lines) in zip(grid[0], shapes.items(), strict=True):
-            _draw_shapes(axes, lines)
+            _draw_shapes(axes, lines, across=0, widths=(1.0, 1.4, 2.0))
             _draw_weight(axes, gravity[name])
             gap = np.linalg.norm(lines["statics"][-1] - lines["constant curvature"][-1])
             state = "" if found[name].converged else ", NO EQUILIBRIUM"
@@ -116,15 +112,22 @@ def _shapes(chain: ElasticChain, found: Equilibrium) -> dict[str, Float[np.ndarr
     }
 
 
-def _draw_shapes(axes: Any, lines: Mapping[str, Float[np.ndarray, "P 3"]]) -> None:
+def _draw_shapes(
+    axes: Any,
+    lines: Mapping[str, Float[np.ndarray, "P 3"]],
+    *,
+    across: int,
+    widths: Sequence[float],
+) -> None:
+    """Lines of ``_shapes`` in one view; ``across`` is its axis to the right, 0 for x, 1 for y."""
     looks = {
-        "straight": {"color": GREY, "lw": 1, "ls": ":"},
-        "constant curvature": {"color": _METHODS["PCC from lengths"], "lw": 1.4, "ls": "--"},
-        "statics": {"color": _METHODS["FSL"], "lw": 2.0},
+        "straight": {"color": GREY, "ls": ":"},
+        "constant curvature": {"color": _METHODS["PCC from lengths"], "ls": "--"},
+        "statics": {"color": _METHODS["FSL"]},
     }
-    for name, line in lines.items():
-        axes.plot(*line[:, [0, 2]].T, label=name, **looks[name])
-    axes.set_xlabel("x [mm]")
+    for (name, line), width in zip(lines.items(), widths, strict=True):
+        axes.plot(*line[:, [across, 2]].T, label=name, lw=width, **looks[name])
+    axes.set_xlabel(f"{'xy'[across]} [mm]")
     axes.set_ylabel("z [mm]")
 
 

@@ -43,6 +43,13 @@ def test_a_wheel_that_one_noisy_reading_takes_for_right_is_looked_at_again(muxar
     assert not verdict.offences, (verdict.offences, verdict.steps)
 
 
+def test_a_tendon_that_slipped_unseen_while_its_encoder_stuck_comes_to_its_length(muxarm):
+    """Found by a long campaign: five slips of a clutch are more than the journal lets pass."""
+    verdict = run(muxarm, draw(muxarm, 3953))
+    assert verdict.ending == "safe"
+    assert not verdict.offences, (verdict.offences, verdict.steps)
+
+
 def test_a_seed_plays_the_same_again(muxarm):
     one, two = (run(muxarm, draw(muxarm, 11)) for _ in range(2))
     assert one == two

@@ -13,6 +13,7 @@ from muxjax.hardware.journal import (
     LegEntry,
     MemoryJournal,
     ProgramEntry,
+    RepairEntry,
     ServoEntry,
     SessionEntry,
     is_journal,
@@ -34,6 +35,7 @@ ENTRIES = [
     LegEntry(visit=1, leg=1, goals={1: 0.01}, lengths=(0.0, 0.001)),
     AtEntry(lengths=(0.004, None)),
     ServoEntry(servo=2, reason="stalled"),
+    RepairEntry(encoders=(2,), lengths=(0.004, 0.002)),
     DoneEntry(visit=1, lengths=(0.01, 0.001)),
     EndEntry(completed=True, reason="completed", lengths=(0.01, 0.001)),
 ]
@@ -68,6 +70,7 @@ def test_standing_after_each_entry():
         (0, 1, {1: 0.01}, start, False),
         (0, 1, {1: 0.01}, (0.004, 0.001), False),
         (0, 1, {1: 0.01}, (0.004, 0.001), False),
+        (0, 1, {1: 0.01}, (0.004, 0.002), False),
         (1, 0, None, (0.01, 0.001), False),
         (1, 0, None, (0.01, 0.001), True),
     ]

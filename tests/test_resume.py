@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 from test_executor import MortalLink, program, random_program, visit
 
-from muxjax.hardware import LockstepLink, MemoryJournal, execute, resume
+from muxjax.hardware import LockstepLink, MemoryJournal, execute, resume, take_stock
 from muxjax.hardware.executor import Executor, begin
-from muxjax.hardware.journal import Journal, LegEntry
+from muxjax.hardware.journal import Journal, LegEntry, RepairEntry, ServoEntry
 from muxjax.hardware.protocol import BoardState
+from muxjax.pipeline import run_to_target
 from muxjax.robot import Robot
 from muxjax.scheduler import Program
 
@@ -146,6 +147,75 @@ def test_an_arm_that_was_moved_by_hand_is_refused(muxarm):
             ValueError, match=r"lengths: tendon 9 stands 3.* from where the journal"
         ):
             resume(journal, link)
+
+
+@pytest.fixture
+def moved(muxarm):
+    """A run of which nothing is left for tendon 9, which then slipped further than passes."""
+    legs = [visit(muxarm, 3, [{3: 0.02}]), visit(muxarm, 2, [{1: 0.02}])]
+    made = program(muxarm, [*legs, visit(muxarm, 3, [{3: -0.01}])])
+    assert 9 in made.instructions[0].clutches
+    link, journal = LockstepLink(muxarm), begun(muxarm, made)
+    run_until(link, journal, 20.0)
+    pass_time(link, 1.0)
+    assert journal.standing.done == 1
+    link.board.mechanics._wind(8, 0.003)
+    return made, link, journal
+
+
+def test_a_repaired_encoder_is_believed_and_the_run_comes_to_the_same_lengths(moved):
+    made, link, journal = moved
+    with pytest.raises(ValueError, match="--repaired-encoders"):
+        resume(journal, link)
+    before = travel(link)
+    assert take_stock(journal, link, repaired_encoders=(9,)).completed
+    assert (travel(link) == before).all()
+    assert isinstance(journal.entries[-1], RepairEntry)
+    assert resume(journal, link).completed
+    assert link.board.mechanics.displacements == pytest.approx(np.array(made.target), abs=END_M)
+
+
+def test_what_nobody_vouched_for_stays_refused(moved):
+    _, link, journal = moved
+    link.board.mechanics._wind(4, -0.003)
+    entries = len(journal.entries)
+    with pytest.raises(ValueError, match=r"lengths: tendon 5 stands 3.* mm .*, at most 2 mm"):
+        run_to_target(link, journal, repaired_encoders=(9,))
+    assert len([e for e in journal.entries[entries:] if isinstance(e, RepairEntry)]) == 0
+
+
+def test_a_repaired_encoder_in_another_turn_is_refused(moved):
+    _, link, journal = moved
+    link.board.mechanics._wind(8, 0.05)
+    with pytest.raises(ValueError, match=r"lengths: tendon 9 stands 53 mm .*, at most 39.3 mm"):
+        take_stock(journal, link, repaired_encoders=(9,))
+
+
+def test_believing_says_what_it_cannot_do(moved):
+    made, link, journal = moved
+    with pytest.raises(ValueError, match="repaired_encoders: tendons are 1 to 9, found 0"):
+        take_stock(journal, link, repaired_encoders=(0, 9))
+    with pytest.raises(ValueError, match="only for going on"):
+        run_to_target(link, journal, made, repaired_encoders=(9,))
+    with pytest.raises(ValueError, match="journal: holds no program"):
+        take_stock(MemoryJournal(), link, repaired_encoders=(9,))
+    link.board.senses.encoders.broken[8] = 2
+    run = run_to_target(link, journal, repaired_encoders=(9,))
+    assert (run.completed, run.resumable) == (False, False)
+    assert run.reason == "the encoder of wheel 9 flags every sample"
+
+
+def test_a_new_plan_begins_where_the_wheels_are_not_where_the_journal_left_them(muxarm):
+    made = program(muxarm, [visit(muxarm, 3, [{3: 0.02}]), visit(muxarm, 2, [{1: 0.02}])])
+    link, journal = LockstepLink(muxarm), begun(muxarm, made)
+    run_until(link, journal, 20.0)
+    pass_time(link, 1.0)
+    assert journal.standing.done == 1
+    journal.write(ServoEntry(servo=1, reason="stalled"))  # and the host died before it looked
+    link.board.mechanics._wind(8, 0.001)  # the clutch of a tendon that was where it should be
+    run = run_to_target(link, journal)
+    assert run.completed, run.reason
+    assert link.board.mechanics.displacements == pytest.approx(np.array(made.target), abs=END_M)
 
 
 def test_a_board_that_lost_its_turns_does_not_spoil_the_journal(muxarm):

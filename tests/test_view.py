@@ -23,6 +23,7 @@ from muxjax.hardware.journal import (
     Entry,
     LegEntry,
     ProgramEntry,
+    RepairEntry,
     ServoEntry,
     SessionEntry,
 )
@@ -393,6 +394,17 @@ def test_the_next_run_of_a_journal_begins_elsewhere_at_once(arm, program):
         assert not after.moving.any()
         assert any("its start is elsewhere" in mark.phase for mark in two.marks)
         np.testing.assert_allclose(two.at(two.duration_s).displacements, ends, atol=1e-3)
+
+
+def test_a_repaired_encoder_moves_nothing_in_time(arm, program):
+    entries = entries_of(arm, program)
+    plain = track_of_journal(arm, entries, "mine")
+    lengths = (*entries[-1].lengths[:-1], entries[-1].lengths[-1] + 0.003)
+    repair = RepairEntry(encoders=(9,), lengths=lengths)
+    track = track_of_journal(arm, [*entries, repair], "mine")
+    assert track.duration_s == plain.duration_s
+    assert track.marks[-1].phase == "repaired encoders: [9]"
+    np.testing.assert_allclose(track.at(track.duration_s).displacements, lengths)
 
 
 def test_servos_that_a_program_left_out_are_back_in_the_next_one(arm, program):

@@ -154,6 +154,7 @@ def run(
 def resume(
     journal: Annotated[Path, tyro.conf.Positional],
     bus: str,
+    repaired_encoders: tuple[int, ...] = (),
     robot: str = "muxarm",
     planner: Method = "exact",
     preset: str = "paper",
@@ -170,9 +171,13 @@ def resume(
 
     Example: muxjax resume run.journal --bus lab
 
+    Example: muxjax resume run.journal --bus lab --repaired-encoders 9
+
     Args:
         journal: File that muxjax run has written.
         bus: As for muxjax run.
+        repaired_encoders: Tendons whose wheel encoders were repaired since: what those say now is
+            believed, however far from the journal within a quarter of a wheel's turn.
         robot: Shipped robot or path of a YAML file.
         planner: Method of new plans; muxjax plan calls it --method.
         preset: Weights of their cost: paper, fastest, no-overshoot, gentle, or a YAML file.
@@ -199,7 +204,12 @@ def resume(
             translation,
             log,
             lambda link, tell: run_to_target(
-                link, into, method=planner, on_progress=tell, **fields
+                link,
+                into,
+                repaired_encoders=repaired_encoders,
+                method=planner,
+                on_progress=tell,
+                **fields,
             ),
         )
         program = into.standing.program

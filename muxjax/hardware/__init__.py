@@ -1,6 +1,6 @@
 """From a program to frames on a bus; a board to try it on. docs/protocol.md has the protocol."""
 
-from muxjax.hardware.executor import Progress, Run, execute, resume
+from muxjax.hardware.executor import Progress, Run, execute, resume, take_stock
 from muxjax.hardware.handshake import Check
 from muxjax.hardware.journal import Journal, MemoryJournal
 from muxjax.hardware.links import BusLink, Link, LockstepLink, Trajectory
@@ -24,4 +24,5 @@ __all__ = [
     "execute",
     "load_physics",
     "resume",
+    "take_stock",
 ]

@@ -8,7 +8,7 @@ be gone in a new session, the same again from the measured lengths.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -140,7 +140,7 @@ def execute(
             "another journal"
         )
     begin(link.robot, program, journal)
-    return _drive(link, journal, on_progress)
+    return _drive(_executor(journal, link), link, on_progress)
 
 
 def begin(robot: Robot, program: Program, journal: MemoryJournal) -> None:
@@ -170,12 +170,51 @@ def resume(journal: MemoryJournal, link: Link, *, on_progress: OnProgress | None
         ValueError: The journal holds no program or one for another robot, the board is another
             one, or a tendon stands elsewhere than the journal left it. Nothing has moved then.
     """
-    return _drive(link, journal, on_progress)
+    return _drive(_executor(journal, link), link, on_progress)
 
 
-def _drive(link: Link, journal: MemoryJournal, on_progress: OnProgress | None) -> Run:
+def take_stock(
+    journal: MemoryJournal,
+    link: Link,
+    *,
+    repaired_encoders: Collection[int] = (),
+    on_progress: OnProgress | None = None,
+) -> Run:
+    """Write into a journal where the wheels are now, as a new plan has to know. Nothing moves.
+
+    Every tendon must stand where the journal left it, but for those whose encoders were repaired:
+    while an encoder stood still its clutch may have let the tendon slip unseen, further than
+    ``resume`` lets pass. Whoever repaired it vouches for it by naming it here.
+
+    Args:
+        journal: Of the run that was interrupted.
+        link: The way to the board.
+        repaired_encoders: Tendons, from 1.
+        on_progress: As for ``execute``.
+
+    Returns:
+        A run whose ``completed`` says whether they were written; its ``reason``, if not.
+
+    Raises:
+        ValueError: No such tendon, or as for ``resume``; also a repaired encoder's wheel that is
+            more than a quarter of a turn from where the journal has it, for it may then be in
+            another turn.
+    """
+    n_tendons = link.robot.n_tendons
+    unknown = sorted(set(repaired_encoders) - set(range(1, n_tendons + 1)))
+    if unknown:
+        raise ValueError(f"repaired_encoders: tendons are 1 to {n_tendons}, found {unknown[0]}")
+    executor = _executor(journal, link)
+    executor.only_take_stock(repaired_encoders)
+    return _drive(executor, link, on_progress)
+
+
+def _executor(journal: MemoryJournal, link: Link) -> Executor:
+    return Executor(link.robot, journal, link.new_session(), link.stream_divider)
+
+
+def _drive(executor: Executor, link: Link, on_progress: OnProgress | None) -> Run:
     layouts()  # reading the DBC takes a moment: not once the first command is under way
-    executor = Executor(link.robot, journal, link.new_session(), link.stream_divider)
     frames: list[Frame] = []
     told = -1
     with no_long_pauses():
@@ -295,6 +334,10 @@ class Executor(Transaction):
         self._script.close()
         self._script, self._script_due = self._stop_board(reason), -math.inf
 
+    def only_take_stock(self, repaired_encoders: Collection[int]) -> None:
+        """Instead of running: see ``take_stock``."""
+        self._script = self._stock(repaired_encoders)
+
     def progress(self) -> Progress:
         """What the run is at."""
         return Progress(
@@ -379,6 +422,14 @@ class Executor(Transaction):
         self._guarded = False
         yield from self._command(Op.DISARM)
         self._end_session()
+
+    def _stock(self, repaired_encoders: Collection[int]) -> Script[None]:
+        try:
+            yield from self._take_stock(repaired_encoders)
+            self._completed, self._reason = True, "completed"
+        except Failed as failure:
+            self._reason, self._refused = str(failure), isinstance(failure, Wrong)
+            self._resumable = failure.after is not After.REPAIR
 
     def _end_session(self) -> None:
         """Armed no more."""

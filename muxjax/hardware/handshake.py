@@ -3,13 +3,21 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Collection, Iterable
 from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float
 
-from muxjax.hardware.journal import Entry, Lengths, MemoryJournal, SessionEntry, Standing
+from muxjax.hardware.journal import (
+    AtEntry,
+    Entry,
+    Lengths,
+    MemoryJournal,
+    RepairEntry,
+    SessionEntry,
+    Standing,
+)
 from muxjax.hardware.protocol import (
     COUNTS_PER_TURN,
     OFFLINE,
@@ -27,6 +35,7 @@ from muxjax.scheduler import Program
 
 START_TOLERANCE_MM = 0.5  # how far the wheels may stand from program.start
 RESUME_TOLERANCE_MM = 2.0  # and from where the journal left them: clutches that dropped out slip
+SURE_OF_TURN = 0.25  # of a wheel's turn: one further from where it should be may be in another turn
 TAKEOVER_S = 1.0  # by then a board is up, and its watchdog has let go of a host that died
 READING_TRIES = 12
 READING_S = 0.1  # for one frame of every stream, right after it began anew
@@ -104,12 +113,7 @@ class Handshake(Session):
 
     def _open(self) -> Script[None]:
         """Greet, learn where everything is, check it, arm."""
-        self.phase = "handshake"
-        self._armed_at, self.sensors, self.checks = None, Sensors(self.robot), ()
-        self._lengths_agree = False
-        yield from self._greet()
-        expected = self.journal.standing
-        yield from self._learn_turns(expected)
+        expected = yield from self._look()
         self.phase = "preflight"
         self.checks = self._preflight(expected)
         self._lengths_agree = self._lengths_check(expected).passed
@@ -128,6 +132,29 @@ class Handshake(Session):
                 lengths=self._heard_lengths(),
             )
         )
+
+    def _look(self) -> Script[Standing]:
+        """Greet and learn where everything is; where the journal has it."""
+        self.phase = "handshake"
+        self._armed_at, self.sensors, self.checks = None, Sensors(self.robot), ()
+        self._lengths_agree = False
+        yield from self._greet()
+        expected = self.journal.standing
+        yield from self._learn_turns(expected)
+        return expected
+
+    def _take_stock(self, encoders: Collection[int]) -> Script[None]:
+        """Write down where the wheels are, also of tendons (from 1) with repaired encoders."""
+        expected = yield from self._look()
+        self.checks = (self._lengths_check(expected, encoders),)
+        self._lengths_agree = self.checks[0].passed
+        if not self._lengths_agree:
+            self._refuse(self.checks[0], expected)
+        lengths = self._heard_lengths()
+        if encoders:
+            self._write(RepairEntry(encoders=tuple(encoders), lengths=lengths))
+        else:
+            self._write(AtEntry(lengths=lengths))
 
     def _greet(self) -> Script[None]:
         """HELLO, as soon as the board is up or its watchdog has let go of a host that died."""
@@ -162,14 +189,14 @@ class Handshake(Session):
         """
         lost = Fault.TURNS_LOST in self.sensors.faults
         wheels = list(range(self.robot.n_tendons))
-        turn = COUNTS_PER_TURN * self.sensors.metres_per_count
+        sure = SURE_OF_TURN * COUNTS_PER_TURN * self.sensors.metres_per_count
         for _ in range(READING_TRIES):
             if lost:
                 yield from self._read_anew(lambda: self.sensors.angles_known)
                 yield from self._give_turns(wheels, expected)
             yield from self._read_anew(lambda: self.sensors.complete)
             off = _beyond(self.sensors.displacements(), expected)
-            wheels = np.flatnonzero(off > turn / 4).tolist()
+            wheels = np.flatnonzero(off > sure).tolist()
             if not wheels:
                 return
 
@@ -244,18 +271,24 @@ class Handshake(Session):
         status = self.sensors.servo_status
         return [s for s in self._needed_servos(expected) if status[s - 1] & (STALLED | OFFLINE)]
 
-    def _lengths_check(self, expected: Standing) -> Check:
-        """Whether the arm is where the program starts, or where the journal left it."""
+    def _lengths_check(self, expected: Standing, believed: Collection[int] = ()) -> Check:
+        """Whether the arm is where the program starts, or where the journal left it.
+
+        A tendon (from 1) that is believed only has to be in the turn that the journal has it in.
+        """
         begun = expected.begun
-        limit = RESUME_TOLERANCE_MM if begun else START_TOLERANCE_MM
+        limits = np.full(self.robot.n_tendons, RESUME_TOLERANCE_MM if begun else START_TOLERANCE_MM)
+        turn_mm = 1e3 * COUNTS_PER_TURN * self.sensors.metres_per_count
+        limits[[tendon - 1 for tendon in believed]] = turn_mm * SURE_OF_TURN
         off = 1e3 * _beyond(self.sensors.displacements(), expected)
+        worst = int((off / limits).argmax())
         what = "where the journal left it" if begun else "it"
         name = "lengths" if begun else "program.start"
         return Check(
             name,
-            bool(off.max() <= limit),
-            f"tendon {int(off.argmax()) + 1} stands {off.max():.3g} mm from {what}, at most "
-            f"{limit:g} mm",
+            bool((off <= limits).all()),
+            f"tendon {worst + 1} stands {off[worst]:.3g} mm from {what}, at most "
+            f"{limits[worst]:.3g} mm",
         )
 
     def _refuse(self, check: Check, expected: Standing) -> None:
@@ -267,7 +300,10 @@ class Handshake(Session):
                 "stands straight unless LockstepLink(robot, displacements=program.start) says so"
             )
         if check.name == "lengths":
-            raise Wrong(text)
+            raise Wrong(
+                f"{text}; after the repair of an encoder that reads right now, muxjax resume "
+                "--repaired-encoders TENDON believes it"
+            )
         if check.name == "servos":
             raise Failed(text, After.REPAIR, servo=self._silent_servos(expected)[0])
         raise Failed(text, After.RESUME)

@@ -78,6 +78,17 @@ class ServoEntry(Strict):
     reason: str
 
 
+class RepairEntry(Strict):
+    """Wheel encoders were repaired, says an operator: they are right and the journal was not.
+
+    On the disk at once.
+    """
+
+    kind: Literal["repair"] = "repair"
+    encoders: tuple[int, ...]  # of tendons, from 1
+    lengths: Lengths
+
+
 class EndEntry(Strict):
     """A run ended, one way or the other. On the disk at once."""
 
@@ -88,7 +99,14 @@ class EndEntry(Strict):
 
 
 Entry: TypeAlias = (
-    ProgramEntry | SessionEntry | LegEntry | AtEntry | DoneEntry | ServoEntry | EndEntry
+    ProgramEntry
+    | SessionEntry
+    | LegEntry
+    | AtEntry
+    | DoneEntry
+    | ServoEntry
+    | RepairEntry
+    | EndEntry
 )
 _ENTRY: TypeAdapter[Entry] = TypeAdapter(Annotated[Entry, Field(discriminator="kind")])
 

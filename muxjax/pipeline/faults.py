@@ -16,7 +16,8 @@ import scipy
 from jaxtyping import Float
 
 from muxjax.hardware import Link, MemoryJournal, Run, execute, resume
-from muxjax.hardware.executor import MEND_COUNTS, OnProgress
+from muxjax.hardware.executor import MEND_COUNTS, OnProgress, take_stock
+from muxjax.hardware.journal import Standing
 from muxjax.hardware.protocol import COUNTS_PER_TURN
 from muxjax.kinematics import check_configuration
 from muxjax.planning import Plan, PlanningError, Problem, plan
@@ -74,6 +75,7 @@ def run_to_target(
     journal: MemoryJournal,
     program: Program | None = None,
     *,
+    repaired_encoders: tuple[int, ...] = (),
     method: str = "exact",
     on_progress: OnProgress | None = None,
     **fields: Any,
@@ -84,6 +86,8 @@ def run_to_target(
         link: The way to the board.
         journal: Of this run, or of the one to go on with.
         program: What to run; None to go on with the journal's.
+        repaired_encoders: Tendons (from 1) whose wheel encoders were repaired since the journal's
+            run: they are believed before it goes on, see ``take_stock``.
         method: Planner.
         on_progress: As for ``execute``.
         **fields: Other fields of ``Problem`` for the new plans, such as ``world``.
@@ -93,13 +97,21 @@ def run_to_target(
         servo is left.
 
     Raises:
-        ValueError: See ``execute`` and ``resume``.
+        ValueError: See ``execute``, ``resume`` and ``take_stock``; repaired encoders for a
+            program that only begins.
         PlanningError: There is no way on with the servos that are left.
     """
-    if (
-        program is None
-        and (program := _without_failed(link.robot, journal, method, fields)) is None
-    ):
+    if program is not None and repaired_encoders:
+        raise ValueError("repaired_encoders: only for going on with a journal's program")
+    if program is None:
+        if repaired_encoders or _left(journal.standing):
+            stock = take_stock(
+                journal, link, repaired_encoders=repaired_encoders, on_progress=on_progress
+            )
+            if not stock.completed:
+                return stock
+        program = _without_failed(link.robot, journal, method, fields)
+    if program is None:
         run = resume(journal, link, on_progress=on_progress)
     else:
         run = execute(program, link, journal=journal, on_progress=on_progress)
@@ -119,10 +131,8 @@ def _without_failed(
     None if none of the program's has failed, or all have.
     """
     now = journal.standing
-    if now.program is None:
-        return None
-    left = tuple(s for s in now.program.servos if s not in now.failed_servos)
-    if not left or left == now.program.servos:
+    left = _left(now)
+    if now.program is None or not left:
         return None
     measured = np.array(now.lengths, dtype=np.float64)
     target = np.array(now.program.target)
@@ -130,6 +140,13 @@ def _without_failed(
     if found.status == "failed":
         raise PlanningError(f"{method}: without servos {now.failed_servos}: {found.reason}")
     return schedule(robot, found)
+
+
+def _left(now: Standing) -> tuple[int, ...]:
+    """Servos with which to plan anew; () if none of the program's has failed, or all have."""
+    servos = () if now.program is None else now.program.servos
+    left = tuple(s for s in servos if s not in now.failed_servos)
+    return () if left == servos else left
 
 
 @dataclass(frozen=True, eq=False)

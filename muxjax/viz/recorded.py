@@ -14,6 +14,7 @@ from muxjax.hardware.journal import (
     Entry,
     LegEntry,
     ProgramEntry,
+    RepairEntry,
     ServoEntry,
     SessionEntry,
     read_entries,
@@ -123,7 +124,7 @@ def track_of_journal(robot: Robot, entries: list[Entry], name: str) -> Track:
             )
             moved = np.abs(reached - now)
             jumps = isinstance(entry, SessionEntry) and bool(np.any(moved[~engaged] > _ELSEWHERE))
-            if not jumps:
+            if not (jumps or isinstance(entry, RepairEntry)):  # which nothing moved for
                 time_s += float(np.max(moved)) / float(robot.tendon_speed)
             now = reached
         if isinstance(entry, LegEntry) and program is not None:
@@ -148,6 +149,8 @@ def track_of_journal(robot: Robot, entries: list[Entry], name: str) -> Track:
             engaged, phase = none, f"stage {entry.visit}: over"
         elif isinstance(entry, SessionEntry):
             engaged, phase = none, "the board is armed"
+        elif isinstance(entry, RepairEntry):
+            engaged, phase = none, f"repaired encoders: {sorted(entry.encoders)}"
         elif isinstance(entry, EndEntry):
             engaged, phase = none, entry.reason
         if jumps:

@@ -27,6 +27,7 @@ SLIPS = 1.2  # of the physics' slip at a clutch, at most
 ENCODER_M = 5e-5  # noise, rounding and what is left of the encoders' errors
 BOOT_S = 2.0
 COOLING_S = 300.0
+ENCODERS = (FaultKind.ENCODER_STUCK, FaultKind.ENCODER_PARITY, FaultKind.ENCODER_MAGNET)
 
 
 class HostKilled(Exception):  # noqa: N818 - no error, an event
@@ -104,7 +105,8 @@ def run(robot: Robot, scenario: Scenario) -> Verdict:
     verdict.ending = _judge_rest(scenario, link, judge, last, verdict)
     if verdict.ending == "safe":
         _repair(link)
-        last = _host(scenario, link, journal, verdict)
+        encoders = {f.index for f in scenario.lasting if f.kind in ENCODERS and f.index}
+        last = _host(scenario, link, journal, verdict, tuple(sorted(encoders)))
         if last is None or not last.completed:
             verdict.offences.append("did not complete once everything was repaired")
     link.kills = ()
@@ -117,14 +119,22 @@ def run(robot: Robot, scenario: Scenario) -> Verdict:
 
 
 def _host(
-    scenario: Scenario, link: MortalLink, journal: MemoryJournal, verdict: Verdict
+    scenario: Scenario,
+    link: MortalLink,
+    journal: MemoryJournal,
+    verdict: Verdict,
+    repaired: tuple[int, ...] = (),
 ) -> Run | None:
-    """Begin, and go on until it is done or nobody can: the last run, None if it was refused."""
+    """Begin, and go on until it is done or nobody can: the last run, None if it was refused.
+
+    The operator names the encoders that were repaired, as docs/running.md asks for.
+    """
     last: Run | None = None
     for _ in range(RETURNS):
         begun = journal.standing.program is not None
         try:
-            last = run_to_target(link, journal, None if begun else scenario.program)
+            program = None if begun else scenario.program
+            last = run_to_target(link, journal, program, repaired_encoders=repaired)
         except HostKilled:
             verdict.steps.append(f"{link.now:.2f} s: host killed")
             _operator(link)

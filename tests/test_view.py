@@ -259,7 +259,7 @@ def test_a_programs_track_is_its_timeline_and_ends_at_the_target(arm, program):
     assert track.duration_s == line.time_s[-1]
     np.testing.assert_allclose(track.at(track.duration_s).displacements, program.target)
     np.testing.assert_allclose(track.at(-1.0).displacements, program.start)
-    assert track.at(1e9).phase == "done"
+    assert track.at(1e9).marks.phase == "done"
     assert not track.at(1e9).moving.any()
     times = [mark.since_s for mark in track.marks]
     assert times == sorted(times)
@@ -275,7 +275,7 @@ def test_a_programs_track_is_its_timeline_and_ends_at_the_target(arm, program):
         assert set(np.flatnonzero(moment.moving) + 1) <= set(item.clutches)
         assert moment.moving.any()
     assert track.marks[0].lost.tolist() == [False, True, False]
-    assert {track.at(time_s).left_out for time_s in line.time_s} == {(2,)}
+    assert {track.at(time_s).marks.left_out for time_s in line.time_s} == {(2,)}
 
 
 def test_a_turning_drum_is_between_its_positions(arm, program):
@@ -284,7 +284,7 @@ def test_a_turning_drum_is_between_its_positions(arm, program):
     assert turning
     moment = track.at(turning[-1].since_s + 1.0)
     assert moment.slot == 0
-    assert not moment.engaged.any()
+    assert not moment.marks.engaged.any()
 
 
 def test_files_of_every_kind_are_read(arm, program, tmp_path):
@@ -342,7 +342,7 @@ def test_a_journal_plays_the_run_without_being_touched(arm, program, recorded):
     assert path.read_bytes() == before
     end = track.at(track.duration_s)
     np.testing.assert_allclose(end.displacements, run.measured, atol=5e-5)
-    assert end.phase == "completed"
+    assert end.marks.phase == "completed"
     np.testing.assert_allclose(track.target, program.target)
     moving = [m for m in track.marks if m.phase.endswith(("move", "moves"))]
     assert len(moving) >= len(program.instructions)
@@ -439,7 +439,7 @@ def test_a_servo_that_dies_in_a_run_is_out_of_use_from_then_on(arm, program, tmp
         end = track.at(track.duration_s)
         np.testing.assert_allclose(end.displacements, program.target, atol=5e-5)
         later = track.at((track.marks[first].since_s + track.duration_s) / 2)
-        assert later.lost[2], name
+        assert later.marks.lost[2], name
 
 
 def test_files_that_cannot_be_played_say_why(arm, program, recorded, tmp_path):

@@ -88,7 +88,8 @@ class Desk:
     @property
     def now(self) -> Moment:
         """The arm at rest as it stands, with the failed servos."""
-        return replace(still(self.robot, self.displacements, self.axial), lost=self.failed)
+        now = still(self.robot, self.displacements, self.axial)
+        return replace(now, marks=replace(now.marks, lost=self.failed))
 
     def set_q_deg(self, q_deg: Float[np.ndarray, " dof"]) -> None:
         """Bend the arm; tendons follow (M Eq. 6).

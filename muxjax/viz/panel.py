@@ -189,7 +189,7 @@ def readout(
     lines = [f"tool at {x:.1f}, {y:.1f}, {z:.1f} mm; {off:.1f} mm from the target"]
     for side, track in zip(("left", "right"), tracks, strict=True):
         if track is not None:
-            phase = track.at(time_s).phase
+            phase = track.at(time_s).marks.phase
             ends = f"{min(time_s, track.duration_s):.1f} of {track.duration_s:.1f} s"
             lines.append(f"**{side}**: {track.name}, {ends}: {phase} ({track.kind})")
     if colour == "tension":

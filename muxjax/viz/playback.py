@@ -43,19 +43,13 @@ class Moment:
         displacements: Of the tendons [m].
         moving: Tendons that move.
         axial: Axial position from 0, fractions between two; None if not known.
-        engaged: Tendons whose clutches are in.
-        lost: Servos that are out of use.
-        phase: In words.
-        left_out: Those of them, from 1, that have not failed: the program does without them.
+        marks: What the drive does.
     """
 
     displacements: Float[np.ndarray, " SJ"]
     moving: Bool[np.ndarray, " SJ"]
     axial: float | None
-    engaged: Bool[np.ndarray, " SJ"]
-    lost: Bool[np.ndarray, " J"]
-    phase: str
-    left_out: tuple[int, ...] = ()
+    marks: Marks
 
     @property
     def slot(self) -> int:
@@ -99,13 +93,11 @@ class Track:
         around = time_s + np.array([-0.5, 0.0, 0.5]) * _WINDOW_S
         before, now, after = self.line.at(around)
         fast = np.abs(after - before) > _STILL * self.top_speed * _WINDOW_S
-        mark = self.marks[max(0, self._index(time_s))]
+        marks = self.marks[max(0, self._index(time_s))]
         axial = None
         if len(self.axial_s):
             axial = float(np.interp(time_s, self.axial_s, self.axial))
-        return Moment(
-            now, fast & mark.engaged, axial, mark.engaged, mark.lost, mark.phase, mark.left_out
-        )
+        return Moment(now, fast & marks.engaged, axial, marks)
 
     def _index(self, time_s: float) -> int:
         times = [mark.since_s for mark in self.marks]
@@ -117,7 +109,7 @@ def still(robot: Robot, displacements: Float[np.ndarray, " SJ"], axial: int | No
     n, j = robot.n_tendons, robot.tendons_per_segment
     none = np.zeros(n, bool)
     at = None if axial is None else float(axial - 1)
-    return Moment(displacements, none, at, none, np.zeros(j, bool), "at rest")
+    return Moment(displacements, none, at, Marks(0.0, none, np.zeros(j, bool), "at rest"))
 
 
 def track_of_program(robot: Robot, program: Program, name: str) -> Track:

@@ -216,10 +216,10 @@ class Stage:
         for s, (box, label) in enumerate(zip(self._servos, self._names, strict=True)):
             place = drum.servo_place(robot, s, 0.0 if axial is None else axial)
             box.position, box.wxyz = place.frame[:3, 3], quaternion(place.frame[:3, :3])
-            lost = bool(moment.lost[s])
+            lost = bool(moment.marks.lost[s])
             turns = bool(moment.slot) and bool(moment.moving[drum.facing(robot, moment.slot)[s]])
             box.color = (115, 115, 115) if lost else ((200, 70, 0) if turns else (70, 70, 70))
-            why = ": not in the program" if s + 1 in moment.left_out else ": failed"
+            why = ": not in the program" if s + 1 in moment.marks.left_out else ": failed"
             state = why if lost else (" turns" if turns else "")
             label.text = f"servo {s + 1}{state}"
             # Above the drum, on a mast, no name is hidden by it.
@@ -227,10 +227,10 @@ class Stage:
             masts[s, 0], masts[s, 1] = place.frame[:3, 3], label.position
             box.visible = label.visible = known
         self._masts.points, self._masts.visible = masts.astype(np.float32), known
-        _set_lines(self._shafts, drum.shafts(robot, moment.slot, moment.engaged))
+        _set_lines(self._shafts, drum.shafts(robot, moment.slot, moment.marks.engaged))
         _set_lines(
             self._crosses,
-            drum.crosses(robot, moment.lost, axial) if axial is not None else _no_lines()[:0],
+            drum.crosses(robot, moment.marks.lost, axial) if axial is not None else _no_lines()[:0],
         )
 
 

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from muxjax.precision import check_last_axis, host_array, numpy_in_numpy_out
+from muxjax.precision import check_last_axis, host_array, matmul, numpy_in_numpy_out
 from muxjax.robot import Robot
 
 Array = jax.Array | np.ndarray
@@ -98,16 +98,16 @@ def segment_transform(
 
 def pose_from_bending(robot: Robot, b: Float[Array, "*batch S 2"]) -> Float[Array, "*batch 4 4"]:
     """Tool pose in the world (M Eq. 2, between the base and the tool frame)."""
-    return segment_ends(robot, b)[..., -1, :, :] @ robot.tool
+    return matmul(segment_ends(robot, b)[..., -1, :, :], robot.tool)
 
 
 def segment_ends(robot: Robot, b: Float[Array, "*batch S 2"]) -> Float[Array, "*batch S 4 4"]:
     """Poses in the world of the distal discs T_1 ... T_S."""
     steps = segment_transform(b, jnp.asarray(robot.length))
-    pose = robot.base @ steps[..., 0, :, :]
+    pose = matmul(robot.base, steps[..., 0, :, :])
     ends = [pose]
     for i in range(1, robot.n_segments):
-        pose = pose @ steps[..., i, :, :]
+        pose = matmul(pose, steps[..., i, :, :])
         ends.append(pose)
     return jnp.stack(ends, axis=-3)
 
@@ -158,7 +158,7 @@ def backbone(
     pose = jnp.broadcast_to(jnp.asarray(robot.base, b.dtype), (*b.shape[:-2], 1, 4, 4))
     frames = [pose]
     for i in range(robot.n_segments):
-        frames.append(pose @ partial_arcs[..., i, :, :, :])
+        frames.append(matmul(pose, partial_arcs[..., i, :, :, :]))
         pose = frames[-1][..., -1:, :, :]
     return jnp.concatenate(frames, axis=-3)
 
@@ -191,7 +191,7 @@ def jacobian(
     polar = jnp.stack([radial, tangential], axis=-1)  # d b_i / d (theta_i, phi_i)
     by_bending = bending_jacobian(robot, bending_from_configuration(q), frame)
     columns = by_bending.reshape(*by_bending.shape[:-1], robot.n_segments, 2)
-    by_q = jnp.einsum("...rsx,...sxy->...rsy", columns, polar)
+    by_q = jnp.einsum("...rsx,...sxy->...rsy", columns, polar, precision="highest")
     return by_q.reshape(*by_bending.shape)
 
 
@@ -203,7 +203,7 @@ def bending_jacobian(
     Each segment adds the twist of its distal disc, carried to the tool by the rigid remainder.
     """
     ends = segment_ends(robot, b)
-    tip = ends[..., -1, :, :] @ robot.tool
+    tip = matmul(ends[..., -1, :, :], robot.tool)
     starts = jnp.concatenate(
         [
             jnp.broadcast_to(jnp.asarray(robot.base), ends[..., :1, :, :].shape),
@@ -212,8 +212,9 @@ def bending_jacobian(
         axis=-3,
     )
     linear, angular = _segment_twist(b, jnp.asarray(robot.length))
-    angular = ends[..., :3, :3] @ angular  # body of the distal disc -> world, (..., S, 3, 2)
-    linear = starts[..., :3, :3] @ linear
+    # Body of the distal disc -> world, (..., S, 3, 2).
+    angular = matmul(ends[..., :3, :3], angular)
+    linear = matmul(starts[..., :3, :3], linear)
     arm = tip[..., None, :3, 3] - ends[..., :3, 3]
     linear = linear + jnp.cross(angular, arm[..., None], axis=-2)
     rotation = jnp.swapaxes(tip[..., :3, :3], -1, -2)
@@ -221,9 +222,9 @@ def bending_jacobian(
         jnp.moveaxis(rows, -3, -2).reshape(*rows.shape[:-3], 3, -1) for rows in (linear, angular)
     )
     if frame == "body":
-        linear = rotation @ linear
+        linear = matmul(rotation, linear)
     if frame != "base":
-        angular = rotation @ angular
+        angular = matmul(rotation, angular)
     return jnp.concatenate([linear, angular], axis=-2)
 
 

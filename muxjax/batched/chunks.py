@@ -25,12 +25,13 @@ from muxjax.batched.formulas import (
     length_values,
     pose_values,
 )
-from muxjax.precision import host_array
+from muxjax.precision import by_device, host_array
 from muxjax.robot import Robot
 
 Array = jax.Array | np.ndarray
 
 CHUNK = 1 << 17  # configurations a call: in cache, and long against the 0.1 ms that a call costs
+CHUNK_ELSEWHERE = 1 << 20  # on a GPU
 QUADS: dict[str, int] = {"position": 1, "quaternion": 2, "matrix": 3}
 
 
@@ -178,7 +179,7 @@ def _in_chunks(
     b = _shaped_bending(arm, bending)
     flat = b.reshape(-1, 2 * arm.n_segments)
     result = np.empty((len(flat), sum(widths)), np.float32)
-    size = min(CHUNK, 1 << max(6, (len(flat) - 1).bit_length()))
+    size = min(by_device(CHUNK, CHUNK_ELSEWHERE), 1 << max(6, (len(flat) - 1).bit_length()))
     rows = np.zeros((2 * arm.n_segments, size), np.float32)
     quads: Vector | None = None
     for start in range(0, len(flat), size):

@@ -36,7 +36,7 @@ from muxjax.collision.distances import (
 )
 from muxjax.collision.world import World
 from muxjax.kinematics import bending_from_configuration
-from muxjax.precision import check_last_axis
+from muxjax.precision import by_device, check_last_axis, matmul
 from muxjax.robot import Robot
 
 Array = jax.Array | np.ndarray
@@ -49,6 +49,7 @@ TOOL_SPACING = 0.01  # between points of the tool's line [m]
 # a bend so tight would be the discs' own limit.
 NEIGHBOURS = np.pi
 CHUNK = 2048  # configurations at a time, for the cache
+CHUNK_ELSEWHERE = 1 << 17  # on a GPU
 _TERMS = 16  # of the series below: the first one left out is below 1e-17 up to 360 degrees
 _LEAST = 1e-12  # added to E^2 [m^2]
 
@@ -202,12 +203,12 @@ def _bending(robot: Robot, q: Array) -> jax.Array:
 def _in_chunks(robot: Robot, measure: Callable[[jax.Array], jax.Array], b: jax.Array) -> jax.Array:
     """``measure`` of (2S, N) columns, for any batch; large ones piece by piece."""
     rows = b.reshape(-1, 2 * robot.n_segments)
-    count = len(rows)
-    if count <= CHUNK:
+    count, size = len(rows), by_device(CHUNK, CHUNK_ELSEWHERE)
+    if count <= size:
         result = measure(rows.T).T
     else:
-        padded = jnp.pad(rows, ((0, -count % CHUNK), (0, 0)))
-        pieces = padded.reshape(-1, CHUNK, rows.shape[1])
+        padded = jnp.pad(rows, ((0, -count % size), (0, 0)))
+        pieces = padded.reshape(-1, size, rows.shape[1])
         result = lax.map(lambda piece: measure(piece.T), pieces)
         result = jnp.swapaxes(result, 1, 2).reshape(len(padded), -1)[:count]
     return result.reshape(*b.shape[:-1], -1)
@@ -318,7 +319,7 @@ def _tool_rows(
     balls, sizes, squares = (
         jnp.asarray(x, dtype) for x in (world.carried, world.carried_radius, world.carried_slack)
     )
-    balls = balls @ tool[:3, :3].T + tool[:3, 3]
+    balls = matmul(balls, tool[:3, :3].T) + tool[:3, 3]
     squares = squares**2
     offset = np.array(robot.config.tool_frame.xyz_m)
     if world.tool_line and offset.any():

@@ -15,6 +15,7 @@ from jax import lax
 
 from muxjax.collision.sampled import Grid
 from muxjax.collision.world import World
+from muxjax.precision import matmul
 
 Array = jax.Array
 Point = tuple[Array, Array, Array]
@@ -69,7 +70,7 @@ def _least(
 
 def _to_round(item: tuple[Array, ...], at: Point) -> Array:
     begin, along, radius = item
-    square = along @ along
+    square = matmul(along, along)
     x, y, z = (p - begin[k] for k, p in enumerate(at))
     t = (x * along[0] + y * along[1] + z * along[2]) * (1 / jnp.where(square > 0, square, 1.0))
     t = jnp.clip(t, 0.0, 1.0)

@@ -23,6 +23,7 @@ from muxjax.ik.arcs import Array, Numbers, conjugate
 from muxjax.ik.newton import Solved, in_pieces, newton, padded, smallest_singular, solved
 from muxjax.ik.planar import planar_seeds
 from muxjax.ik.reduction import INTERVALS, Target, chord, equation, point, sweep
+from muxjax.precision import by_device
 
 REFINEMENTS = 4  # regula falsi steps inside a bracket
 POLISH_STEPS = 3
@@ -38,6 +39,7 @@ SEARCH_STEPS = 30
 SEARCH_DAMPING = 0.1
 NEAR = 1e-3  # error, over the arm's length or [rad], from which the polish goes on
 SWEEP_ROWS = (1, 16, 256)
+SWEEP_ROWS_ELSEWHERE = (16, 4096)  # on a GPU
 BEYOND_LIMIT = 0.2  # [rad] by which a candidate may pass its bending limit before it is polished
 # A solution may pass its bending limit by this much [rad] and is then taken to lie on it.
 AT_LIMIT = 1e-9
@@ -146,10 +148,11 @@ def _seeds_of(
 ) -> tuple[Int[np.ndarray, " m"], Float[np.ndarray, "6 m"]]:
     """Target and bending of every candidate."""
     w_min = np.cos(theta_max / 2)
+    sizes = by_device(SWEEP_ROWS, SWEEP_ROWS_ELSEWHERE)
     found = []
     start = 0
     while start < len(rows):
-        size = next((s for s in SWEEP_ROWS if s >= len(rows) - start), SWEEP_ROWS[-1])
+        size = next((s for s in sizes if s >= len(rows) - start), sizes[-1])
         piece = rows[start : start + size]
         start += size
         part = padded(target[:, piece], size)

@@ -30,7 +30,7 @@ from muxjax.kinematics import (
     configuration_from_bending,
     pose_from_bending,
 )
-from muxjax.precision import check_last_axis
+from muxjax.precision import by_device, check_last_axis
 from muxjax.robot import Robot
 
 Array = jax.Array | np.ndarray
@@ -52,6 +52,7 @@ TILT = 0.1  # [rad] by which the second start leaves the reference, each segment
 
 # Poses of a round are padded to one of these, so that few sizes are ever compiled.
 _BUCKETS = (1, 16, 256)
+_BUCKETS_ELSEWHERE = (16, 1 << 12)  # on a GPU
 
 
 def solve_by_descent(
@@ -134,9 +135,10 @@ def _solve_in_rounds(
 
 def _buckets(rows: Int[np.ndarray, " n"]) -> list[Int[np.ndarray, " bucket"]]:
     """Rows cut into pieces of the compiled sizes; the last piece repeats its last row."""
+    sizes = by_device(_BUCKETS, _BUCKETS_ELSEWHERE)
     pieces = []
     while len(rows):
-        size = next((s for s in _BUCKETS if s >= len(rows)), _BUCKETS[-1])
+        size = next((s for s in sizes if s >= len(rows)), sizes[-1])
         piece, rows = rows[:size], rows[size:]
         pieces.append(np.pad(piece, (0, size - len(piece)), mode="edge"))
     return pieces

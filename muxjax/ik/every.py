@@ -16,11 +16,13 @@ from muxjax.ik.goals import check_weights
 from muxjax.ik.levenberg import MOST_SEGMENTS
 from muxjax.ik.result import AllIkResult
 from muxjax.ik.several import solutions_from_table
+from muxjax.precision import by_device
 from muxjax.robot import Robot
 
 Array = jax.Array | np.ndarray
 
 CHUNK = 1024  # poses at a time
+CHUNK_ELSEWHERE = 1 << 13  # on a GPU
 
 
 def all_ik(
@@ -71,15 +73,16 @@ def all_ik(
     tolerance = (POSITION_TOLERANCE, ORIENTATION_TOLERANCE)
     parts, complete = [], np.ones(len(flat), bool)
     with jax.enable_x64(True):
-        for start in range(0, len(flat), CHUNK):
-            chunk = flat[start : start + CHUNK]
+        size = by_device(CHUNK, CHUNK_ELSEWHERE)
+        for start in range(0, len(flat), size):
+            chunk = flat[start : start + size]
             if whole and is_exhaustive(robot):
                 goal = disc_goals(host, chunk)
                 found, certain = solutions_of_three(host.length, host.theta_max, goal, tolerance)
             else:
                 found, certain = solutions_from_table(host, chunk, wanted, tolerance)
             parts.append(found._replace(row=found.row + start))
-            complete[start : start + CHUNK] = certain
+            complete[start : start + size] = certain
     result = _packed(host, len(flat), parts, complete)
     return jax.tree.map(lambda x: x.reshape((*batch, *x.shape[1:])), result)
 

@@ -27,6 +27,7 @@ from muxjax.ik.arcs import Array, dot
 from muxjax.ik.goals import Frames, Kind, frames_of, goal_errors, goal_rows, kind_of, sizes
 from muxjax.ik.newton import FLOOR, padded, within
 from muxjax.ik.stacked import eliminated, stacked_pose, stacked_tip
+from muxjax.precision import by_device
 from muxjax.robot import Robot
 
 MOST_SEGMENTS = 8  # the written-out code grows with the square of the segments
@@ -35,6 +36,7 @@ PULL = 0.5  # of the reference, times the error (at most 1)
 DRAWN_BACK = 0.25  # what is left of a step that did not descend
 AT_LIMIT = 1 - 1e-12  # of its limit, from which a segment lies on it
 ROWS = 128  # configurations a call: one size is ever compiled
+ROWS_ELSEWHERE = 1 << 13  # on a GPU
 
 
 class Reached(NamedTuple):
@@ -176,16 +178,17 @@ def levenberg(
         downhill: Never up, and without the pull of the reference: for goals out of reach.
     """
     ends, known = np.empty_like(start), np.empty((3, start.shape[1]))
-    shape = (robot.n_segments, 2, ROWS)
+    size = by_device(ROWS, ROWS_ELSEWHERE)
+    shape = (robot.n_segments, 2, size)
     # Put on the device once: every array from the host costs a call ten microseconds.
     fixed = jax.device_put(
         (robot.length, robot.theta_max, frames_of(robot), weights, steps, downhill)
     )
     length, theta_max, frames, metric, count, down = fixed
     kind, pulled = kind_of(weights), bool(np.count_nonzero(weights) < len(start))
-    for first in range(0, start.shape[1], ROWS):
-        piece = slice(first, first + ROWS)
-        b, near, to = (padded(x[:, piece], ROWS) for x in (start, reference, goal))
+    for first in range(0, start.shape[1], size):
+        piece = slice(first, first + size)
+        b, near, to = (padded(x[:, piece], size) for x in (start, reference, goal))
         last, errors = _descend(
             length,
             theta_max,
@@ -199,8 +202,8 @@ def levenberg(
             kind=kind,
             pulled=pulled,
         )
-        here = min(ROWS, start.shape[1] - first)
-        ends[:, piece] = np.asarray(last).reshape(-1, ROWS)[:, :here]
+        here = min(size, start.shape[1] - first)
+        ends[:, piece] = np.asarray(last).reshape(-1, size)[:, :here]
         known[:, piece] = np.asarray(errors)[:, :here]
     return Reached(ends, *known)
 

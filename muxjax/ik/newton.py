@@ -21,10 +21,12 @@ from muxjax.batched import WIDE_VECTORS
 from muxjax.batched.formulas import product
 from muxjax.ik.arcs import Array, conjugate
 from muxjax.ik.stacked import Placed, Stacked, eliminated, stacked_pose, stacked_tip
+from muxjax.precision import by_device
 
 FLOOR = 1e-20  # added to J'J, whose entries are about 1
 INVERSE_ITERATIONS = 24  # for the smallest singular value
 ROWS = (16, 128)  # configurations a call: two sizes are ever compiled
+ROWS_ELSEWHERE = (128, 1 << 15)  # on a GPU
 NO_TOOL = (np.zeros(()),) * 3
 
 
@@ -112,12 +114,13 @@ def _smallest(length: Float[Array, " S"], b: Float[Array, "dof rows"]) -> Array:
 
 
 def in_pieces(rows: int) -> list[tuple[slice, int]]:
-    """Slices of up to ROWS[-1] rows and the compiled size that each is padded to."""
+    """Slices of the rows and the compiled size that each is padded to."""
+    sizes = by_device(ROWS, ROWS_ELSEWHERE)
     pieces = []
     start = 0
     while start < rows:
         left = rows - start
-        size = next((s for s in ROWS if s >= left), ROWS[-1])
+        size = next((s for s in sizes if s >= left), sizes[-1])
         pieces.append((slice(start, start + min(left, size)), size))
         start += size
     return pieces

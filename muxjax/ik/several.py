@@ -20,10 +20,11 @@ from muxjax.ik.all_solutions import AT_LIMIT, Found, repeated
 from muxjax.ik.arcs import Array
 from muxjax.ik.checks import distance_from_root, reach
 from muxjax.ik.goals import Frames, Kind, frames_of, goal_rows, kind_of, tool_goals
-from muxjax.ik.levenberg import ROWS, levenberg, reached, scales
+from muxjax.ik.levenberg import ROWS, ROWS_ELSEWHERE, levenberg, reached, scales
 from muxjax.ik.newton import padded
 from muxjax.ik.stacked import stacked_tip
 from muxjax.ik.table import nearest_entries, table
+from muxjax.precision import by_device
 from muxjax.robot import Robot
 
 NEAREST = 32  # starts, of the table's entries nearest to a pose
@@ -115,9 +116,10 @@ def _smallest_singular(
     ones = np.where(weights > 0, 1.0, 0.0)
     counted = np.flatnonzero(weights)  # the rows of free axes are zero, or left out
     values = np.empty(b.shape[1])
-    for first in range(0, b.shape[1], ROWS):
-        piece = slice(first, first + ROWS)
-        part = padded(b[:, piece], ROWS).reshape(-1, 2, ROWS)
+    size = by_device(ROWS, ROWS_ELSEWHERE)
+    for first in range(0, b.shape[1], size):
+        piece = slice(first, first + size)
+        part = padded(b[:, piece], size).reshape(-1, 2, size)
         found = _jacobian(robot.length, frames_of(robot), part, ones, kind=kind_of(weights))
         rows = np.moveaxis(np.asarray(found), -1, 0)[: len(values[piece]), counted]
         values[piece] = np.linalg.svd(rows, compute_uv=False)[:, -1]

@@ -14,10 +14,11 @@ from muxjax.planning import full_moves
 from muxjax.planning.exact import exact
 from muxjax.planning.lattice import Lattice
 from muxjax.planning.problem import Plan, Problem, check_ends, check_problem
-from muxjax.precision import cores, host_array
+from muxjax.precision import by_device, cores, host_array
 from muxjax.robot import Robot
 
 _CHUNK = 16  # problems in one compiled call: their tables then stay in a core's cache
+_CHUNK_ELSEWHERE = 256  # on a GPU
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,9 +82,12 @@ def plan_batch(robot: Robot, starts: Any, targets: Any, **fields: Any) -> PlanBa
             f"plan_batch: takes robots of at most {full_moves.MOST_TENDONS} tendons, whose servos "
             "meet one layer at an axial position"
         )
-    chunks = [slice(i, i + _CHUNK) for i in range(0, len(goals), _CHUNK)]
+    size = by_device(_CHUNK, _CHUNK_ELSEWHERE)
+    chunks = [slice(i, i + size) for i in range(0, len(goals), size)]
     with ThreadPoolExecutor(cores()) as pool:
-        parts = pool.map(lambda rows: _costs(robot, common, begins[rows], goals[rows]), chunks)
+        parts = pool.map(
+            lambda rows: _costs(robot, common, size, begins[rows], goals[rows]), chunks
+        )
         cost = np.concatenate(list(parts))
     return PlanBatch(robot, common, begins, goals, cost)
 
@@ -91,13 +95,14 @@ def plan_batch(robot: Robot, starts: Any, targets: Any, **fields: Any) -> PlanBa
 def _costs(
     robot: Robot,
     common: Problem,
+    size: int,
     starts: Float[np.ndarray, "n SJ"],
     targets: Float[np.ndarray, "n SJ"],
 ) -> Float[np.ndarray, " n"]:
     """A chunk, filled up with its first problem."""
     n = len(targets)
     starts, targets = (
-        np.concatenate([x, np.repeat(x[:1], _CHUNK - n, axis=0)]) for x in (starts, targets)
+        np.concatenate([x, np.repeat(x[:1], size - n, axis=0)]) for x in (starts, targets)
     )
     moves = np.abs(targets - starts) > common.tolerance
     unfinished = full_moves.number(moves, robot.tendons_per_segment)

@@ -98,5 +98,8 @@ def _time_above(
     top = jnp.maximum(left, right)
     share = top / jnp.where(crossing, jnp.abs(left - right), 1.0)
     return jnp.einsum(
-        "p,pks->s", duration / left.shape[1], jnp.where(above, 1.0, jnp.where(crossing, share, 0.0))
+        "p,pks->s",
+        duration / left.shape[1],
+        jnp.where(above, 1.0, jnp.where(crossing, share, 0.0)),
+        precision="highest",
     )

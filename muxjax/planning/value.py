@@ -28,7 +28,7 @@ from muxjax.planning.motion import angles_at, bending_angles
 from muxjax.planning.problem import ACTION_SETS, PlanningError, Problem
 from muxjax.planning.search import States
 from muxjax.planning.terms import TERMS, CostTerm, Term, step, transition_cost
-from muxjax.precision import pad_rows
+from muxjax.precision import matmul, pad_rows
 from muxjax.robot import Robot
 from muxjax.tendons import bending_from_displacements
 
@@ -49,8 +49,8 @@ class ValueNet(eqx.Module):
         """Correction in units of the scale, above zero."""
         x = features.astype(jnp.float32)
         for weight, bias in zip(self.weights[:-1], self.biases[:-1], strict=True):
-            x = jax.nn.relu(x @ weight + bias)
-        return jax.nn.softplus((x @ self.weights[-1] + self.biases[-1])[:, 0])
+            x = jax.nn.relu(matmul(x, weight) + bias)
+        return jax.nn.softplus((matmul(x, self.weights[-1]) + self.biases[-1])[:, 0])
 
 
 def value_net(sizes: tuple[int, ...], key: Array) -> ValueNet:

@@ -18,6 +18,7 @@ from muxjax.collision import World, clearance
 from muxjax.kinematics import configuration_from_bending
 from muxjax.planning.motion import LEG_POINTS, leg_points
 from muxjax.planning.terms import Transition
+from muxjax.precision import matmul
 from muxjax.robot import Robot
 from muxjax.tendons import bending_from_displacements
 
@@ -61,10 +62,10 @@ def speed_bound(
     change = jnp.linalg.norm(jnp.diff(b, axis=-3), axis=-1)  # (*n, parts, S)
     length = jnp.asarray(robot.length)
     tool, carried = jnp.asarray(robot.tool), jnp.asarray(world.carried)
-    beyond = jnp.concatenate([tool[None, :3, 3], carried @ tool[:3, :3].T + tool[:3, 3]])
+    beyond = jnp.concatenate([tool[None, :3, 3], matmul(carried, tool[:3, :3].T) + tool[:3, 3]])
     reach = jnp.max(jnp.linalg.norm(beyond, axis=-1))
     lever = length / 2 + jnp.sum(length) - jnp.cumsum(length) + reach
-    return LEG_POINTS * jnp.max(change @ lever, axis=-1)
+    return LEG_POINTS * jnp.max(matmul(change, lever), axis=-1)
 
 
 class Collision(eqx.Module):

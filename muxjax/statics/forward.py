@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from muxjax.precision import check_last_axis, cores, host_array
+from muxjax.precision import by_device, check_last_axis, cores, host_array
 from muxjax.statics import kernel as kn
 from muxjax.statics.chain import ElasticChain
 from muxjax.statics.checks import check_chain, check_given
@@ -30,6 +30,7 @@ Array = Any
 
 MAX_ITERATIONS = 60
 LANES = (1, 64)  # solves that are compiled as one; 64 fit a core's cache
+LANES_ELSEWHERE = (8, 1 << 12)  # on a GPU
 CONTINUATION = ((0.25, 0.5, 0.75, 1.0), tuple(np.arange(1, 33) / 32))  # shares of the load
 
 
@@ -183,7 +184,8 @@ def _solve_chunks(
     XLA runs a chunk on one core, so the chunks are shared out to threads. The first one compiles.
     """
     rows = given.shape[-1]
-    lanes = next((n for n in LANES if n >= rows), LANES[-1])
+    sizes = by_device(LANES, LANES_ELSEWHERE)
+    lanes = next((n for n in sizes if n >= rows), sizes[-1])
 
     def chunk(first: int) -> list[Array]:
         pick = np.minimum(np.arange(first, first + lanes), rows - 1)

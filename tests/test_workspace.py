@@ -323,6 +323,21 @@ def test_more_samples_only_add(muxarm: Robot) -> None:
     assert np.array_equal(few.met_tests & many.met_tests, few.met_tests)
 
 
+@pytest.mark.parametrize(
+    ("sampler", "world"), [("random", None), ("lattice", None), ("random", "cabinet")]
+)
+def test_blocks_of_a_round_change_nothing(
+    muxarm: Robot, sampler: str, world: str | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    arena = None if world is None else muxjax.load_world(world)
+    options = {"samples": (1 if arena else 21) * sampling.BLOCK + 5, "world": arena, **SMALL}
+    one = workspace.sweep(muxarm, sampler=sampler, **options)
+    monkeypatch.setattr(marking, "_on_cpu", lambda: False)
+    monkeypatch.setattr(marking, "BLOCKS_ELSEWHERE", 5)
+    monkeypatch.setattr(marking, "BLOCKS_PER_FLUSH", 7)
+    assert same(one, workspace.sweep(muxarm, sampler=sampler, **options))
+
+
 def test_seeds_differ_and_repeat(muxarm: Robot) -> None:
     a, b, c = (workspace.sweep(muxarm, samples=20_000, seed=s, **SMALL) for s in (1, 1, 2**40 + 1))
     assert same(a, b)

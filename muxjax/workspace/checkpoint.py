@@ -24,7 +24,7 @@ class State:
     blocks: int = 0  # done by all devices together
     counts: np.ndarray = field(default_factory=lambda: np.zeros(0, np.int64))
     looks: list[tuple[int, np.ndarray]] = field(default_factory=list)  # (samples, met)
-    unflushed: int = 0  # rounds
+    unflushed: int = 0  # blocks of each device
 
 
 def start(layout: Layout, identity: str, path: Path | None, samples: int) -> State:

@@ -58,7 +58,8 @@ def sweep(
 
     Dexterity of a cell is the share of 4608 evenly spread orientations that some sample in the
     cell meets within the tolerance. The tables depend on the robot, the seed, the sampler and
-    the grids alone: not on interruptions, nor on how many devices or processes took part.
+    the grids alone: not on interruptions, nor on how many devices or processes took part. (A GPU
+    rounds otherwise than a CPU: samples on the edge of a cell or bin may fall to its other side.)
 
     Under ``jax.distributed`` all processes call this with the same arguments, and all get the
     result; the first one writes files.
@@ -169,7 +170,7 @@ def _run(
     progress: bool | None,
 ) -> None:
     """Visit all blocks; look at the table at each doubling, save now and then."""
-    devices = marking.all_devices().size
+    blocks = marking.all_devices().size * layout.n_blocks  # of a round
     total = -(-samples // BLOCK)
     saved = time.monotonic()
     with _ctrl_c() as asked, Progress(samples, state.blocks * BLOCK, progress) as bar:
@@ -181,11 +182,11 @@ def _run(
             state.tables = marking.visit_round(
                 layout, state.tables, scale, seed, state.blocks, last
             )
-            state.blocks = min(state.blocks + devices, stop)
-            state.unflushed += 1
+            state.blocks = min(state.blocks + blocks, stop)
+            state.unflushed += layout.n_blocks
             rounds += 1
             done = state.blocks == total
-            if state.unflushed == marking.ROUNDS_PER_FLUSH:
+            if state.unflushed >= marking.BLOCKS_PER_FLUSH:
                 flush(layout, state)
             if state.blocks == _next_look(state.blocks - 1) and not done:
                 marks = marking.merged_marks(layout, state.tables)

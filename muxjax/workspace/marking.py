@@ -1,6 +1,7 @@
 """The device side of a sweep: samples in, marks in a table out.
 
-Every device holds its own table of all bins and cells, one byte each, and takes every D-th block.
+Every device holds its own table of all bins and cells, one byte each, and takes every D-th block,
+or K blocks in a row where one would not fill it.
 Tables of several devices, in one process or many, are merged by a maximum: marks are either set
 or not, so the order of merging, the number of devices and a repeated block change nothing.
 """
@@ -33,7 +34,10 @@ from muxjax.workspace.sampling import (
 )
 
 _AXIS = "device"
-ROUNDS_PER_FLUSH = 1 << 13  # 2^13 blocks of 2^17 samples: an int32 count cannot reach 2^31
+BLOCKS_PER_FLUSH = 1 << 13  # 2^13 blocks of 2^17 samples: an int32 count cannot reach 2^31
+# Blocks of a device in a round. On a CPU one fits the cache; a GPU waits for the host unless it is
+# given many, and in a world each sample needs some kilobytes.
+BLOCKS, BLOCKS_ELSEWHERE, BLOCKS_IN_WORLD = 1, 64, 4
 
 
 class Tables(NamedTuple):
@@ -52,6 +56,13 @@ class Layout(NamedTuple):
     n_bins: int
     sampler: Sampler
     in_world: bool = False  # only clear samples leave marks; all are counted
+
+    @property
+    def n_blocks(self) -> int:
+        """Blocks that a device takes in a round."""
+        if _on_cpu():
+            return BLOCKS
+        return BLOCKS_IN_WORLD if self.in_world else BLOCKS_ELSEWHERE
 
     @property
     def n_counts(self) -> int:
@@ -84,6 +95,10 @@ def all_devices() -> Mesh:
     return Mesh(np.array(jax.devices()), (_AXIS,))
 
 
+def _on_cpu() -> bool:
+    return all_devices().devices.flat[0].platform == "cpu"
+
+
 def new_tables(layout: Layout, marks: np.ndarray | None = None) -> Tables:
     """Empty tables; or with the given marks, of size (bins * cells,), on the first device."""
     mesh = all_devices()
@@ -114,7 +129,7 @@ def _zero_counts(layout: Layout) -> jax.Array:
 def visit_round(
     layout: Layout, tables: Tables, scale: Scale, seed: int, first: int, samples: int
 ) -> Tables:
-    """Every device marks one block: blocks ``first`` ... ``first`` + D - 1, up to ``samples``."""
+    """Every device marks K blocks, ``first`` ... ``first`` + D K - 1 in all, up to ``samples``."""
     mesh = all_devices()
     whole, rest = divmod(samples, BLOCK)
     limits = np.array([first, whole, rest], np.uint32)
@@ -123,20 +138,23 @@ def visit_round(
         draws: tuple[Any, ...] = (np.array([seed, seed >> 32], np.uint64).astype(np.uint32),)
     else:
         # Beyond the end a device repeats block 0, which changes nothing.
-        blocks = [b if b * BLOCK < samples else 0 for b in range(first, first + mesh.size)]
+        last = first + mesh.size * layout.n_blocks
+        blocks = [b if b * BLOCK < samples else 0 for b in range(first, last)]
         parts = [lattice_parts(dimensions, seed, block) for block in blocks]
         rows = np.stack([rows for rows, _ in parts])
         # Each device is handed its own: picking it on the device would undo the vector code.
         sharding = NamedSharding(mesh, PartitionSpec(_AXIS))
         own = jax.make_array_from_callback(rows.shape, sharding, lambda index: rows[index])
         draws = (own, parts[0][1])
-    slots, clear, mark = _compiled_round(layout, dimensions, mesh)
+    slots, clear, mark = _compiled_round(layout, layout.n_blocks, dimensions, mesh)
     seen = clear(scale, limits, draws) if layout.in_world else None
     return mark(tables, slots(scale._replace(arena=None), limits, draws), seen, limits)
 
 
 @lru_cache(maxsize=16)
-def _compiled_round(layout: Layout, dimensions: int, mesh: Mesh) -> tuple[Any, Any, Any]:
+def _compiled_round(
+    layout: Layout, n_blocks: int, dimensions: int, mesh: Mesh
+) -> tuple[Any, Any, Any]:
     """Samples to slots, samples to whether they are clear, and both to marks.
 
     They are several programs because XLA would otherwise compute the samples again inside the
@@ -145,7 +163,7 @@ def _compiled_round(layout: Layout, dimensions: int, mesh: Mesh) -> tuple[Any, A
     split, same = PartitionSpec(_AXIS), PartitionSpec()
     slots, clear = (
         jax.shard_map(
-            partial(block, layout, dimensions),
+            partial(block, layout, n_blocks, dimensions),
             mesh=mesh,
             in_specs=(same, same, (same,) if layout.sampler == "random" else (split, same)),
             out_specs=split,
@@ -153,7 +171,10 @@ def _compiled_round(layout: Layout, dimensions: int, mesh: Mesh) -> tuple[Any, A
         for block in (_block_slots, _block_clear)
     )
     mark = jax.shard_map(
-        partial(_mark, layout), mesh=mesh, in_specs=(split, split, split, same), out_specs=split
+        partial(_mark, layout, n_blocks),
+        mesh=mesh,
+        in_specs=(split, split, split, same),
+        out_specs=split,
     )
     return (
         jax.jit(slots, compiler_options=WIDE_VECTORS),
@@ -162,13 +183,16 @@ def _compiled_round(layout: Layout, dimensions: int, mesh: Mesh) -> tuple[Any, A
     )
 
 
-def _assignment(limits: UInt32[jax.Array, " 3"]) -> tuple[jax.Array, jax.Array]:
-    """This device's block in a round and how many of its samples are wanted.
+def _assignment(
+    n_blocks: int, limits: UInt32[jax.Array, " 3"]
+) -> tuple[UInt32[jax.Array, " K"], UInt32[jax.Array, " K"]]:
+    """This device's blocks in a round and how many of their samples are wanted.
 
     A device without work repeats block 0 with no sample counted, which changes nothing: marking
     twice is marking once, and block 0 is part of every sweep.
     """
-    wanted = limits[0] + lax.axis_index(_AXIS).astype(jnp.uint32)
+    own = lax.axis_index(_AXIS).astype(jnp.uint32) * np.uint32(n_blocks)
+    wanted = limits[0] + own + lax.iota(jnp.uint32, n_blocks)
     whole, rest = limits[1], limits[2]
     valid = jnp.where(wanted < whole, np.uint32(BLOCK), jnp.where(wanted == whole, rest, 0))
     return jnp.where(valid > 0, wanted, 0), valid
@@ -176,70 +200,76 @@ def _assignment(limits: UInt32[jax.Array, " 3"]) -> tuple[jax.Array, jax.Array]:
 
 def _block_slots(
     layout: Layout,
+    n_blocks: int,
     dimensions: int,
     scale: Scale,
     limits: UInt32[jax.Array, " 3"],
     draws: tuple[jax.Array, ...],
-) -> Int32[jax.Array, "1 R C"]:
-    """Slots of one device's block, all its lanes."""
-    u = _block_bending(layout, dimensions, scale, limits, draws)
-    slots = slot_index(scale.arm, u, scale.reach, layout.shape, layout.per_axis)
+) -> Int32[jax.Array, "K*R C"]:
+    """Slots of one device's blocks, all their lanes."""
+    u = _block_bending(layout, n_blocks, dimensions, scale, limits, draws)
     # Not flattened here: a one-dimensional loop over outer sums is not vectorised.
-    return slots[None]
+    return slot_index(scale.arm, u, scale.reach, layout.shape, layout.per_axis)
 
 
 def _block_clear(
     layout: Layout,
+    n_blocks: int,
     dimensions: int,
     scale: Scale,
     limits: UInt32[jax.Array, " 3"],
     draws: tuple[jax.Array, ...],
-) -> Bool[jax.Array, "1 R C"]:
-    """Whether each lane of one device's block is clear of the world and of itself."""
+) -> Bool[jax.Array, "K*R C"]:
+    """Whether each lane of one device's blocks is clear of the world and of itself."""
     assert scale.arena is not None
     robot, world = scale.arena
-    u = jnp.stack(_block_bending(layout, dimensions, scale, limits, draws), axis=-1)
-    return jnp.asarray(bending_clearance(robot, u.reshape(*u.shape[:-1], -1, 2), world) >= 0)[None]
+    u = jnp.stack(_block_bending(layout, n_blocks, dimensions, scale, limits, draws), axis=-1)
+    return jnp.asarray(bending_clearance(robot, u.reshape(*u.shape[:-1], -1, 2), world) >= 0)
 
 
 def _block_bending(
     layout: Layout,
+    n_blocks: int,
     dimensions: int,
     scale: Scale,
     limits: UInt32[jax.Array, " 3"],
     draws: tuple[jax.Array, ...],
 ) -> Vector:
-    """Bending of one device's block."""
-    block, _ = _assignment(limits)
-    lane = lax.broadcasted_iota(jnp.uint32, (ROWS, COLUMNS), 0) * np.uint32(COLUMNS)
-    lane = lane + lax.broadcasted_iota(jnp.uint32, (ROWS, COLUMNS), 1)
+    """Bending of one device's blocks, one below the other, arrays (K R, C)."""
     if layout.sampler == "random":
+        shape = (n_blocks * ROWS, COLUMNS)
+        lane = lax.broadcasted_iota(jnp.uint32, shape, 0) % np.uint32(ROWS) * np.uint32(COLUMNS)
+        lane = lane + lax.broadcasted_iota(jnp.uint32, shape, 1)
+        block = jnp.repeat(_assignment(n_blocks, limits)[0], ROWS)[:, None]
         fractions = random_fractions(draws[0], block, lane, dimensions)
     else:
-        fractions = lattice_fractions(draws[0][0], draws[1])
+        rows = jnp.moveaxis(draws[0], 0, 1).reshape(dimensions, -1)
+        fractions = lattice_fractions(rows, draws[1])
     return bending_of(scale.arm, scale.theta_max, fractions, layout.in_plane)
 
 
 def _mark(
     layout: Layout,
+    n_blocks: int,
     tables: Tables,
-    slots: Int32[jax.Array, "1 R C"],
-    clear: Bool[jax.Array, "1 R C"] | None,
+    slots: Int32[jax.Array, "K*R C"],
+    clear: Bool[jax.Array, "K*R C"] | None,
     limits: UInt32[jax.Array, " 3"],
 ) -> Tables:
-    """Set the marks of one device's block and count its wanted samples.
+    """Set the marks of one device's blocks and count their wanted samples.
 
-    Lanes beyond the last sample repeat lane 0, uncounted.
+    Lanes beyond the last sample repeat lane 0 of their block, uncounted.
     """
-    _, valid = _assignment(limits)
-    wanted = lax.iota(jnp.uint32, BLOCK) < valid
-    slot = jnp.where(wanted, slots.reshape(BLOCK), slots[0, 0, 0])
+    _, valid = _assignment(n_blocks, limits)
+    wanted = lax.broadcasted_iota(jnp.uint32, (n_blocks, BLOCK), 1) < valid[:, None]
+    slot = jnp.where(wanted, slots.reshape(n_blocks, BLOCK), slots[::ROWS, :1]).reshape(-1)
+    wanted = wanted.reshape(-1)
     cell = slot % layout.n_cells
     counts = tables.counts.at[0, cell].add(wanted.astype(jnp.int32), mode="promise_in_bounds")
     if clear is None:
         marks = tables.marks.at[0, slot].set(np.uint8(1), mode="promise_in_bounds")
         return Tables(marks, counts)
-    free = wanted & clear.reshape(BLOCK)
+    free = wanted & clear.reshape(-1)
     return Tables(
         tables.marks.at[0, slot].max(free.astype(jnp.uint8), mode="promise_in_bounds"),
         counts.at[0, layout.n_cells + cell].add(free.astype(jnp.int32), mode="promise_in_bounds"),
@@ -249,8 +279,10 @@ def _mark(
 def merged_marks(layout: Layout, tables: Tables) -> np.ndarray:
     """Marks of all devices together, bits of cells, shape (bins, ceil(cells / 8))."""
     merged = tables.marks if all_devices().size == 1 else _largest()(tables.marks)
-    marks = np.asarray(merged.addressable_data(0)).reshape(layout.n_bins, layout.n_cells)
-    return np.packbits(marks, axis=1)
+    marks, shape = merged.addressable_data(0), (layout.n_bins, layout.n_cells)
+    if _on_cpu():
+        return np.packbits(np.asarray(marks).reshape(shape), axis=1)
+    return np.asarray(_packed(marks, shape))  # an eighth of the bytes leaves the GPU
 
 
 def flush_counts(layout: Layout, tables: Tables) -> tuple[Tables, np.ndarray]:
@@ -259,6 +291,11 @@ def flush_counts(layout: Layout, tables: Tables) -> tuple[Tables, np.ndarray]:
     # Many devices' sums would leave int32, so they are gathered, not added, on the device.
     counts = np.asarray(total.addressable_data(0), np.int64).reshape(-1, layout.n_counts)
     return Tables(tables.marks, _zero_counts(layout)), counts.sum(axis=0)
+
+
+@partial(jax.jit, static_argnums=1)
+def _packed(marks: UInt8[jax.Array, "1 B*C"], shape: tuple[int, int]) -> UInt8[jax.Array, "B C8"]:
+    return jnp.packbits(marks.reshape(shape), axis=1)
 
 
 @lru_cache(maxsize=1)

@@ -65,7 +65,7 @@ def random_fractions(
 
     Args:
         key: The seed's low and high word.
-        block: Block number, uint32.
+        block: Block number, uint32, of each lane.
         lane: Index inside the block, any shape.
         n: Numbers a lane, at most 2^15.
     """

@@ -30,6 +30,7 @@ import muxjax
 from muxjax.config import load_yaml, replacing
 from muxjax.planning.checkpoint import save_value
 from muxjax.planning.value import ValueNet, n_features, turn_by_a_tendon, value_net
+from muxjax.precision import matmul
 from muxjax.robot import Robot
 from training.config import TrainingConfig, keep_config
 from training.dataset import (
@@ -208,12 +209,14 @@ class _Trainer:
         began = time.monotonic()
         rng = np.random.default_rng([self.config.seed, int(progress.epoch)])
         order = rng.permutation(len(train.bound))
-        net, state, total = progress.net, progress.optimiser, 0.0
+        net, state = progress.net, progress.optimiser
+        losses = []
         for rows in np.array_split(order, batches):
             chosen = _sharded(Decisions(*(x[rows[: len(order) // batches]] for x in train)))
             turn = self.turns[rng.integers(len(self.turns))]
             net, state, loss = _step(self._hyper, optimiser, net, state, chosen, turn)
-            total += float(loss)
+            losses.append(loss)  # not read here: the device would have to be waited for
+        total = sum(float(loss) for loss in losses)
         scores = {k: float(v) for k, v in self._scores(net, held).items()}
         improved = scores["loss"] < float(progress.lowest)
         epoch = int(progress.epoch) + 1
@@ -322,7 +325,7 @@ def _step(
 ) -> tuple[ValueNet, Any, Any]:
     """One step of the optimiser on decisions turned by this matrix (F, F)."""
     inputs = jnp.asarray(decisions.features, jnp.float32)
-    turned = decisions._replace(features=inputs @ turn.T)
+    turned = decisions._replace(features=matmul(inputs, turn.T))
 
     def loss(net: ValueNet) -> jax.Array:
         return _losses(hyper, net, turned)["loss"]

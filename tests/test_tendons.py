@@ -75,7 +75,8 @@ def test_inverse_map_has_the_inverse_derivative(robot, rng, theta):
         lengths = displacements_from_bending(robot, jnp.asarray(b))
         back = jax.jacfwd(lambda x: bending_from_displacements(robot, x))(lengths)
     n = 2 * robot.n_segments
-    product = back.reshape(n, -1) @ there.reshape(-1, n)
+    # In NumPy: outside the context JAX has no float64 product.
+    product = np.asarray(back).reshape(n, -1) @ np.asarray(there).reshape(-1, n)
     np.testing.assert_allclose(product, np.eye(n), rtol=0, atol=1e-12)
 
 

@@ -106,7 +106,8 @@ def test_from_a_bent_start_at_a_known_axial_position(muxarm, rng, action_set):
             assert found.cost >= plan(muxarm, replace(problem, action_set="subsets")).cost - 1e-12
 
 
-@pytest.mark.parametrize("moving", [6, pytest.param(20, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("moving", [6, 20])
 def test_penta_has_twenty_tendons(rng, moving):
     penta = muxjax.load_robot("penta")
     target = random_targets(penta, rng, 1)[0]
@@ -115,6 +116,10 @@ def test_penta_has_twenty_tendons(rng, moving):
     for method in ON_THE_LATTICE:
         found = plan(penta, problem, method)
         assert np.max(np.abs(found.displacements[-1] - target)) <= problem.tolerance
+
+
+def test_a_lattice_beyond_the_memory_is_refused(rng):
+    penta = muxjax.load_robot("penta")
     target = random_targets(penta, rng, 1)[0]
     with pytest.raises(PlanningError, match=r"GiB.*max_step.*beamstep"):
         plan(penta, Problem(np.zeros(20), target, servos=(1, 2, 3, 4), max_step=0.005))

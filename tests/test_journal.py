@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -77,12 +79,16 @@ def test_standing_after_each_entry():
     assert journal.standing.failed_servos == (2,)
 
 
-def test_a_new_program_replaces_the_old_one_but_not_its_failed_servos():
+@pytest.mark.parametrize(("servos", "failed"), [((1,), (2,)), ((1, 2), ())])
+def test_a_new_program_replaces_the_old_one_and_who_gives_it_a_failed_servo_repaired_it(
+    servos, failed
+):
     journal = MemoryJournal()
-    for entry in [*ENTRIES, ENTRIES[0]]:
+    new = ProgramEntry(program=replace(PROGRAM, servos=servos), goals=ENTRIES[0].goals)
+    for entry in [*ENTRIES, new]:
         journal.write(entry)
     now = journal.standing
-    assert (now.done, now.completed, now.failed_servos) == (0, False, (2,))
+    assert (now.done, now.completed, now.failed_servos) == (0, False, failed)
     assert not now.begun  # it begins where the old one ended, not where an accident left the arm
 
 

@@ -7,9 +7,10 @@ import dataclasses
 import numpy as np
 import pytest
 from test_executor import program, random_program, visit
-from test_resume import pass_time
+from test_resume import pass_time, run_until
 
 from muxjax.hardware import LockstepLink, MemoryJournal, execute, load_physics, resume
+from muxjax.hardware.executor import begin
 from muxjax.hardware.faults import FaultConfig
 from muxjax.hardware.protocol import BoardState
 from muxjax.pipeline import run_to_target
@@ -38,6 +39,29 @@ def test_a_servo_that_dies_is_named_and_done_without(muxarm, kind):
     assert done.completed, done.reason
     assert journal.standing.program.servos == (1, 3)
     assert link.board.mechanics.displacements == pytest.approx(np.array(made.target), abs=END_M)
+
+
+def test_a_servo_that_was_repaired_is_not_done_without_for_ever(muxarm):
+    """One journal for program after program, as ``muxjax run --bus`` has by default."""
+    made, _ = random_program(muxarm, np.random.default_rng(3), 3, length=3)
+    dies = fault("servo_offline", index=2, at_op="START", nth=3, delay_s=0.4)
+    link, journal = LockstepLink(muxarm, faults=[dies], stream_divider=5), MemoryJournal()
+    run = run_to_target(link, journal, made)
+    assert (run.completed, run.failed_servos) == (True, (2,))
+    link.board.senses.offline.clear()
+    link.board.mechanics.jammed.clear()
+    back = program(
+        muxarm,
+        [visit(muxarm, 1, [{2: 0.002}]), visit(muxarm, 2, [{2: -0.002}])],
+        np.array(made.target),
+    )
+    begin(muxarm, back, journal)
+    run_until(link, journal, link.now + 4.0)
+    pass_time(link, 1.0)
+    run = run_to_target(link, journal)
+    assert (run.completed, run.failed_servos) == (True, ())
+    assert journal.standing.program == back  # no new plan
+    assert link.board.mechanics.displacements == pytest.approx(np.array(back.target), abs=END_M)
 
 
 def test_a_servo_that_is_dead_before_is_seen_in_the_preflight(muxarm):

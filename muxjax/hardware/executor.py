@@ -68,7 +68,7 @@ class Run:
         trajectory: True displacements over time since arming, where the link knows them.
         resumable: Whether ``resume`` can go on with the journal, after a power-up if the board
             was stopped by ESTOP; False too if a part is to be repaired or replaced first.
-        failed_servos: Servos not to be used again, from 1; ``muxjax.pipeline.run_to_target``
+        failed_servos: Servos out of use, from 1; ``muxjax.pipeline.run_to_target``
             goes on without them.
         checks: The preflight report.
         interrupted: The host has stopped it by ESTOP, for a keyboard interrupt.

@@ -71,7 +71,7 @@ class DoneEntry(Strict):
 
 
 class ServoEntry(Strict):
-    """A servo failed and is not to be used again. On the disk at once."""
+    """A servo failed and is out of use, until a program has it again. On the disk at once."""
 
     kind: Literal["servo"] = "servo"
     servo: int
@@ -122,7 +122,8 @@ class Standing:
         leg: Leg of the next visit that was last started, from 1; 0 if none was.
         lengths: Last known lengths [m]; None for a wheel never heard.
         toward: Goals of the motion that may have been under way, {tendon: m}.
-        failed_servos: Servos not to be used again, ascending.
+        failed_servos: Servos that failed and that no program since has, ascending. New plans do
+            without them; who begins a program with one of them has repaired it.
         completed: Whether the program ran to its end.
         begun: Whether a session has armed the board for it, or for one before that was not
             completed: what then slipped when clutches dropped out, no length tells.
@@ -141,7 +142,7 @@ class Standing:
 
 def standing(entries: Sequence[Entry]) -> Standing:
     """Read a journal's entries from the last program on, and the failed servos of all."""
-    failed = tuple(sorted({e.servo for e in entries if isinstance(e, ServoEntry)}))
+    failed = _failed(entries)
     starts = [k for k, entry in enumerate(entries) if isinstance(entry, ProgramEntry)]
     if not starts:
         return Standing(failed_servos=failed)
@@ -172,6 +173,16 @@ def standing(entries: Sequence[Entry]) -> Standing:
         completed,
         begun=_begun(entries),
     )
+
+
+def _failed(entries: Sequence[Entry]) -> tuple[int, ...]:
+    failed = set[int]()
+    for entry in entries:
+        if isinstance(entry, ServoEntry):
+            failed.add(entry.servo)
+        elif isinstance(entry, ProgramEntry):
+            failed.difference_update(entry.program.servos)
+    return tuple(sorted(failed))
 
 
 def _begun(entries: Sequence[Entry]) -> bool:

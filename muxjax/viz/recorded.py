@@ -103,7 +103,8 @@ def track_of_journal(robot: Robot, entries: list[Entry], name: str) -> Track:
         if isinstance(entry, ProgramEntry):
             check_same_robot(robot, entry.program)
             program = entry.program
-            lost = failed | lost_servos(robot, program.servos)
+            lost = lost_servos(robot, program.servos)
+            failed = failed & lost  # one that a program has again was repaired
             start = np.array(program.start)
             phase = f"a program of {len(program.instructions)} stages begins"
             jumps = bool(points) and bool(np.max(np.abs(start - now)) > _ELSEWHERE)

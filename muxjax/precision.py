@@ -11,7 +11,8 @@ from __future__ import annotations
 import functools
 import inspect
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any, TypeVar
 
 import equinox as eqx
@@ -21,6 +22,7 @@ import numpy as np
 
 F = TypeVar("F", bound=Callable[..., Any])
 T = TypeVar("T")
+R = TypeVar("R")
 
 
 def host_array(name: str, value: Any, last: int | None = None) -> np.ndarray:
@@ -62,6 +64,21 @@ def cores() -> int:
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1
+
+
+def in_threads(work: Callable[[T], R], items: Iterable[T], threads: int | None = None) -> list[R]:
+    """``work`` of every item, in threads that compute on the caller's default device.
+
+    JAX keeps ``jax.default_device`` for each thread.
+    """
+    device = jax.config.jax_default_device  # type: ignore[attr-defined]
+
+    def there(item: T) -> R:
+        with jax.default_device(device):
+            return work(item)
+
+    with ThreadPoolExecutor(threads or cores()) as pool:
+        return list(pool.map(there, items))
 
 
 def on_cpu() -> bool:

@@ -12,9 +12,10 @@ from jax.extend.core import jaxprs_in_params
 import muxjax
 from muxjax import batched
 from muxjax.collision import clearance
+from muxjax.planning import tension
 from muxjax.planning.batch import plan_batch
 from muxjax.planning.value import value_net
-from muxjax.precision import by_device
+from muxjax.precision import by_device, in_threads
 
 Q = [0.5, 1.0, 0.7, 2.0, 0.4, 3.0]
 
@@ -89,9 +90,10 @@ def network(robot, features):
         lambda robot, q: muxjax.backbone(robot, q, 3),
         muxjax.tendon_displacements,
         lambda robot, q: clearance(robot, q, muxjax.load_world("cabinet")),
+        lambda robot, q: tension._lengths(robot, q.T),
         network,
     ],
-    ids=["pose", "jacobian", "backbone", "tendons", "clearance", "network"],
+    ids=["pose", "jacobian", "backbone", "tendons", "clearance", "tension", "network"],
 )
 def test_no_product_may_be_rounded_to_tf32(function, muxarm):
     """What a GPU does with the factors of a float32 product unless it is told not to."""
@@ -101,6 +103,13 @@ def test_no_product_may_be_rounded_to_tf32(function, muxarm):
     assert all(given == (full, full) for given in found)
     if function in (muxjax.forward_kinematics, muxjax.jacobian, network):
         assert found
+
+
+def test_threads_compute_on_the_callers_device():
+    with jax.default_device("cpu"):
+        seen = in_threads(lambda _: jax.config.jax_default_device, range(3), 2)
+    assert seen == ["cpu"] * 3
+    assert in_threads(lambda _: jax.config.jax_default_device, range(3)) == [None] * 3
 
 
 def as_on_a_gpu(monkeypatch):

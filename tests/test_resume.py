@@ -184,11 +184,79 @@ def test_what_nobody_vouched_for_stays_refused(moved):
     assert len([e for e in journal.entries[entries:] if isinstance(e, RepairEntry)]) == 0
 
 
-def test_a_repaired_encoder_in_another_turn_is_refused(moved):
+def test_a_repaired_encoder_too_far_away_is_refused(moved):
     _, link, journal = moved
-    link.board.mechanics._wind(8, 0.05)
-    with pytest.raises(ValueError, match=r"lengths: tendon 9 stands 53 mm .*, at most 39.3 mm"):
+    link.board.mechanics._wind(8, 0.008)
+    with pytest.raises(ValueError, match=r"lengths: tendon 9 stands 11 mm .*, at most 10 mm"):
         take_stock(journal, link, repaired_encoders=(9,))
+
+
+def test_a_tendon_far_off_is_not_believed_in_another_turn(moved):
+    """The board has lost its turns: the reading nearest to the journal may be a turn off."""
+    _, link, journal = moved
+    link.board.mechanics._wind(8, 0.122)
+    link.board.power_cycle()
+    pass_time(link, 2.0)
+    with pytest.raises(ValueError, match=r"lengths: tendon 9 stands 3\d.* mm .*, at most 10 mm"):
+        run_to_target(link, journal, repaired_encoders=(9,))
+
+
+def test_a_repaired_tendon_that_no_instruction_moves_comes_to_its_length_by_a_new_plan(muxarm):
+    made = program(muxarm, [visit(muxarm, 1, [{1: 0.02}]), visit(muxarm, 2, [{1: 0.02}])])
+    link, journal = LockstepLink(muxarm), begun(muxarm, made)
+    assert all(9 not in item.clutches for item in made.instructions)
+    run_until(link, journal, 14.0)
+    pass_time(link, 1.0)
+    link.board.mechanics._wind(8, 0.003)
+    run = run_to_target(link, journal, repaired_encoders=(9,))
+    assert run.completed, run.reason
+    assert [c for c in run.checks if not c.passed] == []
+    assert link.board.mechanics.displacements == pytest.approx(np.array(made.target), abs=END_M)
+
+
+def test_only_a_repaired_tendon_gets_a_new_length(moved):
+    """Else five times a bit by hand would be far, and nobody had said that it is right."""
+    _, link, journal = moved
+    before = journal.standing.lengths
+    link.board.mechanics._wind(4, 0.0019)
+    assert take_stock(journal, link, repaired_encoders=(9,)).completed
+    assert journal.standing.lengths[:8] == before[:8]
+    link.board.mechanics._wind(4, 0.0019)
+    with pytest.raises(ValueError, match=r"lengths: tendon 5 stands 3\.8"):
+        take_stock(journal, link, repaired_encoders=(9,))
+
+
+def test_a_program_that_is_refused_does_not_replace_the_one_before(muxarm):
+    made = program(muxarm, [visit(muxarm, 1, [{1: -0.02}]), visit(muxarm, 2, [{2: 0.02}])])
+    link, journal = LockstepLink(muxarm), begun(muxarm, made)
+    run_until(link, journal, 14.0)
+    pass_time(link, 1.0)
+    journal.write(ServoEntry(servo=2, reason="stalled"))
+    before = journal.standing
+    with pytest.raises(ValueError, match="lengths: tendon"):  # it does not stand at the start
+        execute(made, link, journal=journal)
+    assert journal.standing == before
+    run = run_to_target(link, journal)
+    assert (run.completed, run.failed_servos) == (True, (2,))
+    assert link.board.mechanics.displacements == pytest.approx(np.array(made.target), abs=END_M)
+
+
+def test_stock_that_is_interrupted_leaves_the_run_as_it_was(moved):
+    _, link, journal = moved
+    before = journal.standing
+
+    class Interrupted(LockstepLink):
+        pressed = False
+
+        def wait(self, until):
+            if not self.pressed:
+                self.pressed = True
+                raise KeyboardInterrupt
+            return super().wait(until)
+
+    other = Interrupted(link.robot, displacements=link.board.mechanics.displacements)
+    assert take_stock(journal, other, repaired_encoders=(9,)).interrupted
+    assert journal.standing == before
 
 
 def test_believing_says_what_it_cannot_do(moved):

@@ -154,7 +154,7 @@ def run(
 def resume(
     journal: Annotated[Path, tyro.conf.Positional],
     bus: str,
-    repaired_encoders: tuple[int, ...] = (),
+    repaired_encoders: tuple[int, ...] | None = None,
     robot: str = "muxarm",
     planner: Method = "exact",
     preset: str = "paper",
@@ -177,7 +177,7 @@ def resume(
         journal: File that muxjax run has written.
         bus: As for muxjax run.
         repaired_encoders: Tendons whose wheel encoders were repaired since: what those say now is
-            believed, however far from the journal within a quarter of a wheel's turn.
+            believed up to 10 mm from the journal, and beyond 2 mm a new plan goes on from there.
         robot: Shipped robot or path of a YAML file.
         planner: Method of new plans; muxjax plan calls it --method.
         preset: Weights of their cost: paper, fastest, no-overshoot, gentle, or a YAML file.
@@ -189,6 +189,8 @@ def resume(
         json: Print JSON in SI units.
     """
     arm = load_robot(robot)
+    if repaired_encoders == ():
+        raise ValueError("--repaired-encoders: names no tendon")
     if not journal.is_file():
         raise ValueError(f"{journal}: no such journal; muxjax run --journal writes one")
     translation = None if mapping is None else Translation(mapping)
@@ -206,7 +208,7 @@ def resume(
             lambda link, tell: run_to_target(
                 link,
                 into,
-                repaired_encoders=repaired_encoders,
+                repaired_encoders=repaired_encoders or (),
                 method=planner,
                 on_progress=tell,
                 **fields,

@@ -196,16 +196,15 @@ def take_stock(
         A run whose ``completed`` says whether they were written; its ``reason``, if not.
 
     Raises:
-        ValueError: No such tendon, or as for ``resume``; also a repaired encoder's wheel that is
-            more than a quarter of a turn from where the journal has it, for it may then be in
-            another turn.
+        ValueError: No such tendon, or as for ``resume``; also a repaired encoder whose tendon is
+            more than 10 mm from where the journal has it.
     """
     n_tendons = link.robot.n_tendons
     unknown = sorted(set(repaired_encoders) - set(range(1, n_tendons + 1)))
     if unknown:
         raise ValueError(f"repaired_encoders: tendons are 1 to {n_tendons}, found {unknown[0]}")
     executor = _executor(journal, link)
-    executor.only_take_stock(repaired_encoders)
+    executor.only_take_stock(set(repaired_encoders))
     return _drive(executor, link, on_progress)
 
 
@@ -261,6 +260,7 @@ class Executor(Transaction):
         self._reason = ""
         self._refused = self._completed = self._resumable = False
         self._interrupted = self._estopped = False
+        self._ends_run = True
         self._guarded = False  # whether losing the board, or its armed state, ends the session
         self._first_armed_at: float | None = None  # on the link's clock
         self._duration = 0.0  # of the sessions that are over, while armed
@@ -335,8 +335,8 @@ class Executor(Transaction):
         self._script, self._script_due = self._stop_board(reason), -math.inf
 
     def only_take_stock(self, repaired_encoders: Collection[int]) -> None:
-        """Instead of running: see ``take_stock``."""
-        self._script = self._stock(repaired_encoders)
+        """Instead of running: see ``take_stock``. The journal's run does not end by it."""
+        self._script, self._ends_run = self._stock(repaired_encoders), False
 
     def progress(self) -> Progress:
         """What the run is at."""
@@ -401,14 +401,16 @@ class Executor(Transaction):
                 self._refused = isinstance(failure, Wrong) and self._first_armed_at is None
                 lasting = failure.reason is Reason.WHEEL_STILL  # the clutch slips every time
                 self._resumable = failure.after is not After.REPAIR and not lasting
-                said_so = self.sensors.state is BoardState.ESTOPPED
-                self._estopped = said_so or failure.reason is Reason.ESTOPPED
+                self._estopped = self._latched(failure)
                 break
             left -= 1
             self.phase = "before a new session"
             hot = failure.reason is Reason.COIL_HOT
             yield from self._pause(COOL_S if hot else RESTART_PAUSE_S)
         self._write_end()
+
+    def _latched(self, failure: Failed) -> bool:
+        return self.sensors.state is BoardState.ESTOPPED or failure.reason is Reason.ESTOPPED
 
     def _session(self) -> Script[None]:
         yield from self._open()
@@ -430,6 +432,7 @@ class Executor(Transaction):
         except Failed as failure:
             self._reason, self._refused = str(failure), isinstance(failure, Wrong)
             self._resumable = failure.after is not After.REPAIR
+            self._estopped = self._latched(failure)
 
     def _end_session(self) -> None:
         """Armed no more."""
@@ -525,9 +528,15 @@ class Executor(Transaction):
         self._write_end()
 
     def _write_end(self) -> None:
-        self._note(
-            EndEntry(completed=self._completed, reason=self._reason, lengths=self._heard_lengths())
-        )
+        if self._ends_run:
+            self._note(
+                EndEntry(
+                    completed=self._completed,
+                    reason=self._reason,
+                    lengths=self._heard_lengths(),
+                    refused=self._refused,
+                )
+            )
 
     def _note(self, entry: AtEntry | ServoEntry | EndEntry) -> None:
         """Write what is good to know, but not worth another failure."""

@@ -35,7 +35,9 @@ from muxjax.scheduler import Program
 
 START_TOLERANCE_MM = 0.5  # how far the wheels may stand from program.start
 RESUME_TOLERANCE_MM = 2.0  # and from where the journal left them: clutches that dropped out slip
-SURE_OF_TURN = 0.25  # of a wheel's turn: one further from where it should be may be in another turn
+# A tendon may slip twenty times while its encoder stands still. Much further, a board that lost its
+# turn counts could be told the wrong turn, and nobody would see it.
+REPAIRED_TOLERANCE_MM = 10.0
 TAKEOVER_S = 1.0  # by then a board is up, and its watchdog has let go of a host that died
 READING_TRIES = 12
 READING_S = 0.1  # for one frame of every stream, right after it began anew
@@ -146,13 +148,19 @@ class Handshake(Session):
     def _take_stock(self, encoders: Collection[int]) -> Script[None]:
         """Write down where the wheels are, also of tendons (from 1) with repaired encoders."""
         expected = yield from self._look()
-        self.checks = (self._lengths_check(expected, encoders),)
+        off = 1e3 * beyond(self.sensors.displacements(), expected)
+        believed = [
+            Check(f"encoder {c}", True, f"repaired; {off[c - 1]:.3g} mm from where the journal was")
+            for c in sorted(encoders)
+        ]
+        self.checks = (self._lengths_check(expected, encoders), *believed)
         self._lengths_agree = self.checks[0].passed
         if not self._lengths_agree:
             self._refuse(self.checks[0], expected)
         lengths = self._heard_lengths()
         if encoders:
-            self._write(RepairEntry(encoders=tuple(encoders), lengths=lengths))
+            lengths = tuple(m if c in encoders else None for c, m in enumerate(lengths, start=1))
+            self._write(RepairEntry(encoders=tuple(sorted(encoders)), lengths=lengths))
         else:
             self._write(AtEntry(lengths=lengths))
 
@@ -189,14 +197,14 @@ class Handshake(Session):
         """
         lost = Fault.TURNS_LOST in self.sensors.faults
         wheels = list(range(self.robot.n_tendons))
-        sure = SURE_OF_TURN * COUNTS_PER_TURN * self.sensors.metres_per_count
+        turn = COUNTS_PER_TURN * self.sensors.metres_per_count
         for _ in range(READING_TRIES):
             if lost:
                 yield from self._read_anew(lambda: self.sensors.angles_known)
                 yield from self._give_turns(wheels, expected)
             yield from self._read_anew(lambda: self.sensors.complete)
-            off = _beyond(self.sensors.displacements(), expected)
-            wheels = np.flatnonzero(off > sure).tolist()
+            off = beyond(self.sensors.displacements(), expected)
+            wheels = np.flatnonzero(off > turn / 4).tolist()
             if not wheels:
                 return
 
@@ -274,13 +282,12 @@ class Handshake(Session):
     def _lengths_check(self, expected: Standing, believed: Collection[int] = ()) -> Check:
         """Whether the arm is where the program starts, or where the journal left it.
 
-        A tendon (from 1) that is believed only has to be in the turn that the journal has it in.
+        A tendon (from 1) that is believed may be further away.
         """
         begun = expected.begun
         limits = np.full(self.robot.n_tendons, RESUME_TOLERANCE_MM if begun else START_TOLERANCE_MM)
-        turn_mm = 1e3 * COUNTS_PER_TURN * self.sensors.metres_per_count
-        limits[[tendon - 1 for tendon in believed]] = turn_mm * SURE_OF_TURN
-        off = 1e3 * _beyond(self.sensors.displacements(), expected)
+        limits[[tendon - 1 for tendon in believed]] = REPAIRED_TOLERANCE_MM
+        off = 1e3 * beyond(self.sensors.displacements(), expected)
         worst = int((off / limits).argmax())
         what = "where the journal left it" if begun else "it"
         name = "lengths" if begun else "program.start"
@@ -301,8 +308,9 @@ class Handshake(Session):
             )
         if check.name == "lengths":
             raise Wrong(
-                f"{text}; after the repair of an encoder that reads right now, muxjax resume "
-                "--repaired-encoders TENDON believes it"
+                f"{text}; if encoders were repaired and read right now, muxjax resume "
+                "--repaired-encoders names their tendons, which may be up to "
+                f"{REPAIRED_TOLERANCE_MM:g} mm away"
             )
         if check.name == "servos":
             raise Failed(text, After.REPAIR, servo=self._silent_servos(expected)[0])
@@ -321,7 +329,7 @@ def _interval(
     return low, high
 
 
-def _beyond(measured: Float[np.ndarray, " S*J"], expected: Standing) -> Float[np.ndarray, " S*J"]:
+def beyond(measured: Float[np.ndarray, " S*J"], expected: Standing) -> Float[np.ndarray, " S*J"]:
     """How far each tendon is from where it may be [m]."""
     low, high = _interval(expected)
     return np.maximum(low - measured, measured - high).clip(min=0.0)

@@ -86,7 +86,7 @@ class RepairEntry(Strict):
 
     kind: Literal["repair"] = "repair"
     encoders: tuple[int, ...]  # of tendons, from 1
-    lengths: Lengths
+    lengths: Lengths  # None for the others: nobody vouches for those
 
 
 class EndEntry(Strict):
@@ -96,6 +96,7 @@ class EndEntry(Strict):
     completed: bool
     reason: str
     lengths: Lengths
+    refused: bool = False  # before anything moved: a program that only began is withdrawn
 
 
 Entry: TypeAlias = (
@@ -142,6 +143,7 @@ class Standing:
 
 def standing(entries: Sequence[Entry]) -> Standing:
     """Read a journal's entries from the last program on, and the failed servos of all."""
+    entries = in_force(entries)
     failed = _failed(entries)
     starts = [k for k, entry in enumerate(entries) if isinstance(entry, ProgramEntry)]
     if not starts:
@@ -173,6 +175,18 @@ def standing(entries: Sequence[Entry]) -> Standing:
         completed,
         begun=_begun(entries),
     )
+
+
+def in_force(entries: Sequence[Entry]) -> list[Entry]:
+    """Entries without the programs that were refused before anything moved for them."""
+    kept = list[Entry]()
+    for entry in entries:
+        kept.append(entry)
+        if isinstance(entry, EndEntry) and entry.refused:
+            begin = max(k for k, e in enumerate(kept) if isinstance(e, ProgramEntry))
+            if not any(isinstance(e, SessionEntry) for e in kept[begin:]):
+                del kept[begin:]
+    return kept
 
 
 def _failed(entries: Sequence[Entry]) -> tuple[int, ...]:

@@ -16,7 +16,8 @@ import scipy
 from jaxtyping import Float
 
 from muxjax.hardware import Link, MemoryJournal, Run, execute, resume
-from muxjax.hardware.executor import MEND_COUNTS, OnProgress, take_stock
+from muxjax.hardware.executor import MEND_COUNTS, OnProgress, begin, take_stock
+from muxjax.hardware.handshake import RESUME_TOLERANCE_MM, beyond
 from muxjax.hardware.journal import Standing
 from muxjax.hardware.protocol import COUNTS_PER_TURN
 from muxjax.kinematics import check_configuration
@@ -87,7 +88,8 @@ def run_to_target(
         journal: Of this run, or of the one to go on with.
         program: What to run; None to go on with the journal's.
         repaired_encoders: Tendons (from 1) whose wheel encoders were repaired since the journal's
-            run: they are believed before it goes on, see ``take_stock``.
+            run: they are believed before it goes on, see ``take_stock``. Where one is further from
+            where the journal left it than ``resume`` lets pass, it goes on by a new plan.
         method: Planner.
         on_progress: As for ``execute``.
         **fields: Other fields of ``Problem`` for the new plans, such as ``world``.
@@ -103,35 +105,45 @@ def run_to_target(
     """
     if program is not None and repaired_encoders:
         raise ValueError("repaired_encoders: only for going on with a journal's program")
-    if program is None:
-        if repaired_encoders or _left(journal.standing):
+    if program is not None:
+        run = execute(program, link, journal=journal, on_progress=on_progress)
+    else:
+        before, elsewhere = journal.standing, False
+        if repaired_encoders or _left(before):
             stock = take_stock(
                 journal, link, repaired_encoders=repaired_encoders, on_progress=on_progress
             )
             if not stock.completed:
                 return stock
-        program = _without_failed(link.robot, journal, method, fields)
-    if program is None:
+            elsewhere = bool((beyond(stock.measured, before) > 1e-3 * RESUME_TOLERANCE_MM).any())
+        if (program := _anew(link.robot, journal, method, fields, elsewhere)) is not None:
+            begin(link.robot, program, journal)
         run = resume(journal, link, on_progress=on_progress)
-    else:
-        run = execute(program, link, journal=journal, on_progress=on_progress)
     while not (run.completed or run.interrupted):
-        program = _without_failed(link.robot, journal, method, fields)
+        program = _anew(link.robot, journal, method, fields)
         if program is None:
             break
-        run = execute(program, link, journal=journal, on_progress=on_progress)
+        begin(link.robot, program, journal)
+        run = resume(journal, link, on_progress=on_progress)
     return run
 
 
-def _without_failed(
-    robot: Robot, journal: MemoryJournal, method: str, fields: dict[str, Any]
+def _anew(
+    robot: Robot,
+    journal: MemoryJournal,
+    method: str,
+    fields: dict[str, Any],
+    elsewhere: bool = False,
 ) -> Program | None:
     """On from where the journal's wheels are, with the servos that are left.
 
-    None if none of the program's has failed, or all have.
+    None if none of the program's has failed, or all have; unless the arm stands elsewhere than the
+    program can have brought it.
     """
     now = journal.standing
     left = _left(now)
+    if elsewhere and now.program is not None and not left:
+        left = now.program.servos
     if now.program is None or not left:
         return None
     measured = np.array(now.lengths, dtype=np.float64)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Callable, Iterable, Mapping
-from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 from muxjax.planning.baselines import greedy, reverse, sequential
@@ -23,7 +22,7 @@ from muxjax.planning.problem import (
     check_problem,
 )
 from muxjax.planning.tension import Tension
-from muxjax.precision import cores
+from muxjax.precision import in_threads
 from muxjax.robot import Robot
 
 METHODS: Mapping[str, Callable[..., Plan]] = {
@@ -93,5 +92,4 @@ def plan_each(
         ValueError: See ``plan``.
         PlanningError: See ``plan``.
     """
-    with ThreadPoolExecutor(cores()) as pool:
-        return list(pool.map(lambda problem: plan(robot, problem, method, **options), problems))
+    return in_threads(lambda problem: plan(robot, problem, method, **options), problems)

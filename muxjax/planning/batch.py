@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -14,7 +13,7 @@ from muxjax.planning import full_moves
 from muxjax.planning.exact import exact
 from muxjax.planning.lattice import Lattice
 from muxjax.planning.problem import Plan, Problem, check_ends, check_problem
-from muxjax.precision import by_device, cores, host_array
+from muxjax.precision import by_device, host_array, in_threads
 from muxjax.robot import Robot
 
 _CHUNK = 16  # problems in one compiled call: their tables then stay in a core's cache
@@ -84,12 +83,8 @@ def plan_batch(robot: Robot, starts: Any, targets: Any, **fields: Any) -> PlanBa
         )
     size = by_device(_CHUNK, _CHUNK_ELSEWHERE)
     chunks = [slice(i, i + size) for i in range(0, len(goals), size)]
-    with ThreadPoolExecutor(cores()) as pool:
-        parts = pool.map(
-            lambda rows: _costs(robot, common, size, begins[rows], goals[rows]), chunks
-        )
-        cost = np.concatenate(list(parts))
-    return PlanBatch(robot, common, begins, goals, cost)
+    parts = in_threads(lambda rows: _costs(robot, common, size, begins[rows], goals[rows]), chunks)
+    return PlanBatch(robot, common, begins, goals, np.concatenate(parts))
 
 
 def _costs(

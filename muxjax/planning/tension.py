@@ -23,6 +23,7 @@ from jaxtyping import Float
 
 from muxjax.kinematics import stumpff
 from muxjax.planning.terms import Transition
+from muxjax.precision import matmul
 from muxjax.robot import Robot
 from muxjax.statics.recursion import solve_pivotless
 from muxjax.statics.tension import ramp
@@ -120,7 +121,7 @@ class Tension(eqx.Module):
 
     def _weight(self, robot: Robot, b: Float[Array, "dof B"]) -> Float[Array, " B"]:
         """Potential of the arm's weight [J]."""
-        down = robot.base[:3, :3].T @ jnp.asarray(self.gravity)
+        down = matmul(robot.base[:3, :3].T, jnp.asarray(self.gravity))
         per_metre = self.mass / jnp.sum(jnp.asarray(robot.length))
         shares = jnp.asarray([*(share for share, _ in GAUSS), 1.0])[:, None, None]
         own = b.reshape(robot.n_segments, 2, -1)
@@ -165,7 +166,7 @@ def _lengths(
         versine = v * (-1 / 2 + v / 24 - v**2 / 720 + v**3 / 40320)
         for i in range(n, s):
             towards = jnp.stack([jnp.cos(psi[n, i]), jnp.sin(psi[n, i])], axis=-1)
-            lever = towards @ own  # b . e_psi
+            lever = matmul(towards, own)  # b . e_psi
             total[i] = total[i] + robot.length[n] * versine - radius * lever * sinc
             along = -0.5 * robot.length[n] * sinc - radius * lever * slope
             parts[i][n] = 2 * quarter * along[:, None] * own - radius * sinc * towards[..., None]

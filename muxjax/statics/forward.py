@@ -7,7 +7,6 @@ for what the plain iteration did not solve, and the traced path with implicit de
 from __future__ import annotations
 
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
 from typing import Any, cast, get_args
 
 import equinox as eqx
@@ -16,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from muxjax.precision import by_device, check_last_axis, cores, host_array
+from muxjax.precision import by_device, check_last_axis, cores, host_array, in_threads
 from muxjax.statics import kernel as kn
 from muxjax.statics.chain import ElasticChain
 from muxjax.statics.checks import check_chain, check_given
@@ -198,8 +197,7 @@ def _solve_chunks(
     firsts = range(0, rows, lanes)
     parts = [chunk(first) for first in firsts[:1]]
     if len(firsts) > 1:
-        with ThreadPoolExecutor(min(cores(), len(firsts) - 1)) as pool:
-            parts.extend(pool.map(chunk, firsts[1:]))
+        parts.extend(in_threads(chunk, firsts[1:], min(cores(), len(firsts) - 1)))
     columns = zip(*parts, strict=True)
     return Solution(*(np.concatenate(column, axis=-1)[..., :rows] for column in columns))
 

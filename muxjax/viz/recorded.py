@@ -17,6 +17,7 @@ from muxjax.hardware.journal import (
     RepairEntry,
     ServoEntry,
     SessionEntry,
+    in_force,
     read_entries,
 )
 from muxjax.recording import LoggedRun, read_log, read_program
@@ -88,6 +89,7 @@ def track_of_journal(robot: Robot, entries: list[Entry], name: str) -> Track:
     Raises:
         ValueError: Its program was made for another robot, or it holds none.
     """
+    entries = in_force(entries)
     if not entries:
         raise ConfigError(f"{name}: the journal holds no program")
     n = robot.n_tendons

@@ -66,7 +66,7 @@ def cores() -> int:
     return os.cpu_count() or 1
 
 
-def in_threads(work: Callable[[T], R], items: Iterable[T], threads: int | None = None) -> list[R]:
+def in_threads(work: Callable[[T], R], items: Iterable[T]) -> list[R]:
     """``work`` of every item, in threads that compute on the caller's default device.
 
     JAX keeps ``jax.default_device`` for each thread.
@@ -77,7 +77,7 @@ def in_threads(work: Callable[[T], R], items: Iterable[T], threads: int | None =
         with jax.default_device(device):
             return work(item)
 
-    with ThreadPoolExecutor(threads or cores()) as pool:
+    with ThreadPoolExecutor(cores()) as pool:
         return list(pool.map(there, items))
 
 
@@ -95,6 +95,12 @@ def by_device(cpu: T, other: T) -> T:
     A GPU takes as long for a hundred rows as for ten thousand, and each call costs it more.
     """
     return cpu if on_cpu() else other
+
+
+def padded_size(rows: int, cpu: Sequence[int], other: Sequence[int]) -> int:
+    """The least of the device's compiled sizes that holds so many rows; else the greatest."""
+    sizes = by_device(cpu, other)
+    return next((size for size in sizes if size >= rows), sizes[-1])
 
 
 def matmul(a: Any, b: Any) -> Any:

@@ -107,7 +107,7 @@ def test_no_product_may_be_rounded_to_tf32(function, muxarm):
 
 def test_threads_compute_on_the_callers_device():
     with jax.default_device("cpu"):
-        seen = in_threads(lambda _: jax.config.jax_default_device, range(3), 2)
+        seen = in_threads(lambda _: jax.config.jax_default_device, range(3))
     assert seen == ["cpu"] * 3
     assert in_threads(lambda _: jax.config.jax_default_device, range(3)) == [None] * 3
 

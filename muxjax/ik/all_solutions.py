@@ -23,7 +23,7 @@ from muxjax.ik.arcs import Array, Numbers, conjugate
 from muxjax.ik.newton import Solved, in_pieces, newton, padded, smallest_singular, solved
 from muxjax.ik.planar import planar_seeds
 from muxjax.ik.reduction import INTERVALS, Target, chord, equation, point, sweep
-from muxjax.precision import by_device
+from muxjax.precision import padded_size
 
 REFINEMENTS = 4  # regula falsi steps inside a bracket
 POLISH_STEPS = 3
@@ -148,11 +148,10 @@ def _seeds_of(
 ) -> tuple[Int[np.ndarray, " m"], Float[np.ndarray, "6 m"]]:
     """Target and bending of every candidate."""
     w_min = np.cos(theta_max / 2)
-    sizes = by_device(SWEEP_ROWS, SWEEP_ROWS_ELSEWHERE)
     found = []
     start = 0
     while start < len(rows):
-        size = next((s for s in sizes if s >= len(rows) - start), sizes[-1])
+        size = padded_size(len(rows) - start, SWEEP_ROWS, SWEEP_ROWS_ELSEWHERE)
         piece = rows[start : start + size]
         start += size
         part = padded(target[:, piece], size)

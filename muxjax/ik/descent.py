@@ -30,7 +30,7 @@ from muxjax.kinematics import (
     configuration_from_bending,
     pose_from_bending,
 )
-from muxjax.precision import by_device, check_last_axis
+from muxjax.precision import check_last_axis, padded_size
 from muxjax.robot import Robot
 
 Array = jax.Array | np.ndarray
@@ -135,10 +135,9 @@ def _solve_in_rounds(
 
 def _buckets(rows: Int[np.ndarray, " n"]) -> list[Int[np.ndarray, " bucket"]]:
     """Rows cut into pieces of the compiled sizes; the last piece repeats its last row."""
-    sizes = by_device(_BUCKETS, _BUCKETS_ELSEWHERE)
     pieces = []
     while len(rows):
-        size = next((s for s in sizes if s >= len(rows)), sizes[-1])
+        size = padded_size(len(rows), _BUCKETS, _BUCKETS_ELSEWHERE)
         piece, rows = rows[:size], rows[size:]
         pieces.append(np.pad(piece, (0, size - len(piece)), mode="edge"))
     return pieces

@@ -21,7 +21,7 @@ from muxjax.batched import WIDE_VECTORS
 from muxjax.batched.formulas import product
 from muxjax.ik.arcs import Array, conjugate
 from muxjax.ik.stacked import Placed, Stacked, eliminated, stacked_pose, stacked_tip
-from muxjax.precision import by_device
+from muxjax.precision import padded_size
 
 FLOOR = 1e-20  # added to J'J, whose entries are about 1
 INVERSE_ITERATIONS = 24  # for the smallest singular value
@@ -115,12 +115,11 @@ def _smallest(length: Float[Array, " S"], b: Float[Array, "dof rows"]) -> Array:
 
 def in_pieces(rows: int) -> list[tuple[slice, int]]:
     """Slices of the rows and the compiled size that each is padded to."""
-    sizes = by_device(ROWS, ROWS_ELSEWHERE)
     pieces = []
     start = 0
     while start < rows:
         left = rows - start
-        size = next((s for s in sizes if s >= left), sizes[-1])
+        size = padded_size(left, ROWS, ROWS_ELSEWHERE)
         pieces.append((slice(start, start + min(left, size)), size))
         start += size
     return pieces

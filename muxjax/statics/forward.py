@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from muxjax.precision import by_device, check_last_axis, cores, host_array, in_threads
+from muxjax.precision import check_last_axis, host_array, in_threads, padded_size
 from muxjax.statics import kernel as kn
 from muxjax.statics.chain import ElasticChain
 from muxjax.statics.checks import check_chain, check_given
@@ -183,8 +183,7 @@ def _solve_chunks(
     XLA runs a chunk on one core, so the chunks are shared out to threads. The first one compiles.
     """
     rows = given.shape[-1]
-    sizes = by_device(LANES, LANES_ELSEWHERE)
-    lanes = next((n for n in sizes if n >= rows), sizes[-1])
+    lanes = padded_size(rows, LANES, LANES_ELSEWHERE)
 
     def chunk(first: int) -> list[Array]:
         pick = np.minimum(np.arange(first, first + lanes), rows - 1)
@@ -195,9 +194,7 @@ def _solve_chunks(
             return [np.asarray(x) for x in found]
 
     firsts = range(0, rows, lanes)
-    parts = [chunk(first) for first in firsts[:1]]
-    if len(firsts) > 1:
-        parts.extend(in_threads(chunk, firsts[1:], min(cores(), len(firsts) - 1)))
+    parts = [chunk(first) for first in firsts[:1]] + in_threads(chunk, firsts[1:])
     columns = zip(*parts, strict=True)
     return Solution(*(np.concatenate(column, axis=-1)[..., :rows] for column in columns))
 

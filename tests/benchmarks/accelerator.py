@@ -240,20 +240,11 @@ def planning(robot: Robot, repeats: int) -> Iterator[Row]:
     )
     from envs.config import load_env_config
     from envs.tdma import Tdma
-    from tests.benchmarks.envs import possible
+    from tests.benchmarks.envs import random_steps
 
     env = Tdma(load_env_config("muxarm"))
 
-    def advance(carry: Any, _: None) -> Any:
-        states, key = carry
-        key, sub = jax.random.split(key)
-        masks = jax.vmap(env.action_mask)(states)
-        actions = jax.vmap(possible)(masks, jax.random.uniform(sub, states.steps.shape))
-        after, outcome = jax.vmap(env.step)(states, actions)
-        states = jax.vmap(env.autoreset)(after, outcome)
-        return (states, key), outcome.reward.sum() + 0 * jax.vmap(env.observe)(states).sum()
-
-    run = jax.jit(lambda carry: jax.lax.scan(advance, carry, None, length=STEPS)[1])
+    run = random_steps(env, STEPS)
     for lanes in (4096, 65536):
         states = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.key(0), lanes))
         start = (states, jax.random.key(1))
@@ -261,7 +252,7 @@ def planning(robot: Robot, repeats: int) -> Iterator[Row]:
             f"environment, {lanes} lanes in a scan",
             lanes * STEPS,
             "steps",
-            lambda start=start: run(start),
+            lambda start=start: run(start)[1][0],
             lambda found, lanes=lanes: f"mean reward {float(found.sum()) / lanes / STEPS:.5f}",
             repeats,
         )

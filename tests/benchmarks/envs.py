@@ -57,9 +57,8 @@ def possible(mask: Any, chance: Any) -> Any:
     return jnp.argmax(count > chance * count[-1]).astype(jnp.int32)
 
 
-def scan() -> list[list[str]]:
-    """A compiled scan."""
-    env = Tdma(load_env_config("muxarm"))
+def random_steps(env: Tdma, steps: int) -> Callable[[Any], Any]:
+    """A compiled scan of random steps: from (states, key) on, sums of rewards and observations."""
 
     def advance(carry: Any, _: None) -> Any:
         states, key = carry
@@ -71,7 +70,13 @@ def scan() -> list[list[str]]:
         seen = jax.vmap(env.observe)(states)
         return (states, key), (outcome.reward.sum(), seen.sum())
 
-    run = jax.jit(lambda carry: jax.lax.scan(advance, carry, None, length=STEPS))
+    return jax.jit(lambda carry: jax.lax.scan(advance, carry, None, length=steps))
+
+
+def scan() -> list[list[str]]:
+    """A compiled scan."""
+    env = Tdma(load_env_config("muxarm"))
+    run = random_steps(env, STEPS)
     states = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.key(0), LANES))
     start = (states, jax.random.key(1))
     call = lambda: jax.block_until_ready(run(start))  # noqa: E731
